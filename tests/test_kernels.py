@@ -13,6 +13,7 @@ from spikeloom.models.networks.layers import spike_linear
 from spikeloom.runtime.machines.changes import Forgetting, single
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.changes import kernel
+from spikeloom.runtime.machines.loihi1.changes.chip import chip_of
 from spikeloom.runtime.machines.loihi1.costs import timing
 from spikeloom.runtime.machines.truenorth import engine as crossbars
 from spikeloom.runtime.studies.robustness.proofs.bounds import lower_bound
@@ -38,7 +39,7 @@ def long_recording(simulate, name):
 
 def known_run(*, channels=0):
     netlist = specimen("counters").machine.netlist
-    chip = kernel.chip_of(netlist)
+    chip = chip_of(netlist)
     return chip, kernel.known_run(chip, np.ones((netlist.n_inputs + channels, 5), np.uint8))
 
 

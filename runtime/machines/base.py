@@ -16,7 +16,7 @@ from spikeloom.compiler.interpret import cut, vote
 from spikeloom.compiler.targets.base import Target, load_target, with_tables
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
-from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting, by_running
+from spikeloom.runtime.machines.changes import Changes, Effects, Groups, by_running
 from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.votes import class_counts
@@ -390,8 +390,18 @@ class Machine(ABC):
         """What changes of a recording (channels, steps) bring about; runs each, unless the chip knows better."""
         return by_running(self.votes, channels, changes)
 
-    def forgetting(self, channels: EventArray) -> Forgetting | None:  # noqa: ARG002
-        """How soon the chip forgets what it was before a step of a recording (channels, steps); None: not known."""
+    def groups(
+        self,
+        channels: EventArray,  # noqa: ARG002
+        steps: int,  # noqa: ARG002
+        decision: int,  # noqa: ARG002
+        apart: IntArray,  # noqa: ARG002
+        reach: int,  # noqa: ARG002
+    ) -> Groups | None:
+        """Bounds of what changed events turn against the decision of a recording (channels, steps); None: not known.
+
+        Events may change in the first `steps`; `apart` (spacings,) rise from 1. See :class:`Groups`.
+        """
         return None
 
     def batch(self, steps: int) -> int:  # noqa: ARG002

@@ -30,7 +30,7 @@ class Effects(NamedTuple):
     # other way
     come: IntArray
     gone: IntArray
-    end: IntArray  # (changes,) int64; chip step from which on a changed run is the known one, in every register
+    end: IntArray  # (changes,) int64; chip step from which on a changed run spikes as the known one
 
     @property
     def votes(self) -> IntArray:
@@ -38,17 +38,15 @@ class Effects(NamedTuple):
         return self.come - self.gone
 
 
-class Forgetting(NamedTuple):
-    """What is open in a recording where nothing was known before a step."""
+class Groups(NamedTuple):
+    """What groups of changed events, each of one step, turn against a decision at most, whatever came before."""
 
     lag: int  # Steps from an event to the first vote that it can alter
-    # quiet, back: (steps + 1,) int64; by that step, the first from which on every spike is known, and every
-    # register
-    quiet: IntArray
-    back: IntArray
-    # gone, come: (steps + 1, steps, classes) int16; votes that may go, and that may come, by step
-    gone: npt.NDArray[np.int16]
-    come: npt.NDArray[np.int16]
+    # (spacings, 2, steps, reach, classes) int32; votes that the decision loses and a class gains from `lag` steps after
+    # the group until `lag` steps after the next: by how many steps ago the group before it was at least; by how many
+    # events it has (one, or more); by its step; and by how many steps later the next one comes, from 1, the last of
+    # them standing for later ones and for none
+    lost: npt.NDArray[np.int32]
 
 
 def single(cells: IntArray) -> Changes:

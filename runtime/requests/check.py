@@ -51,5 +51,6 @@ class CertifyRequest(ClusterChoice, NetlistChoice, RecordingsChoice):
     shift: int = option("largest shift to try", default=25, metavar="BINS")
     most: int = option("largest number of changed events that a proof is tried for", default=16, metavar="N")
     jobs: int | None = option("recordings at a time (default: one a core)", metavar="N")
+    certificate: str | None = option("write what examples/check_certificate.py checks", metavar="OUT")
     picture: str | None = option("draw how many decisions depend on each taxel", metavar="OUT.png|svg|pdf")
     output: str | None = option("write what --json prints", metavar="OUT.json", flags=("-o", "--output"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from spikeloom.compiler.errors import require_least
+from spikeloom.compiler.files import sha256_of
 from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.inputs.checkpoint import places_of
 from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
@@ -15,6 +16,7 @@ from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.check import CertifyRequest
 from spikeloom.runtime.studies.cluster import on_cluster
+from spikeloom.runtime.studies.robustness.certificate_file import write_certificate
 from spikeloom.runtime.studies.robustness.certify_sections import sections, taxel_map
 from spikeloom.runtime.studies.robustness.exhaustive import certify, expected_seconds
 from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
@@ -38,7 +40,8 @@ REQUEST = CertifyRequest
 def run(request: CertifyRequest) -> Outcome:
     """Run the command."""
     require_place(request.output, "-o", request)
-    require_picture(request, [request.output])
+    require_place(request.certificate, "--certificate", request)
+    require_picture(request, [request.output, request.certificate])
     require_least(vars(request), shift=0, most=1, jobs=1)
     machine = machine_for(request.netlist)
     data = load_recordings(request.data, request, machine.netlist, labels_for="certify", joined=False)
@@ -51,6 +54,8 @@ def run(request: CertifyRequest) -> Outcome:
     certificates = certify(machine, data, shift=request.shift, most=request.most, jobs=request.jobs)
     places = places_of(None, machine.netlist.provenance, data.taxels)
     result = replace(certificates, provenance=Provenance.of(request, data.sha256), places=places)
+    if request.certificate is not None:
+        write_certificate(request.certificate, result, sha256_of(request.netlist))
     write_picture(request.picture, lambda: taxel_map(result))
     write_json(request.output, result)
     return Outcome(result, sections)

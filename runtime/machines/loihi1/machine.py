@@ -24,7 +24,7 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.runtime.machines.base import Done, Model, Price, Run, T, differences, one_by_one
 from spikeloom.runtime.machines.capabilities import Cumulative, Damageable, Explainable, Memory, Stoppable
-from spikeloom.runtime.machines.changes import Changes, Effects, Forgetting
+from spikeloom.runtime.machines.changes import Changes, Effects, Groups
 from spikeloom.runtime.machines.deviations import Deviations
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.stream import Stream
@@ -35,7 +35,7 @@ from spikeloom.runtime.report.sections import Block, Outcome
 
 if TYPE_CHECKING:
     from spikeloom.runtime.machines.core_map import CoreMap
-    from spikeloom.runtime.machines.loihi1.changes.kernel import Chip
+    from spikeloom.runtime.machines.loihi1.changes.chip import Chip
 
 # What only some commands need is imported where it is used: a tenth of a second that `run` need not wait.
 
@@ -237,10 +237,10 @@ class Loihi(Damageable, Explainable, Stoppable):
     @cached_property
     def _chip(self) -> Chip | None:
         """For changed runs; None where a register may overflow."""
-        from spikeloom.runtime.machines.loihi1.changes import kernel
+        from spikeloom.runtime.machines.loihi1.changes import chip
 
         self.require_windows()
-        return None if kernel.overflows(self.netlist) else kernel.chip_of(self.netlist)
+        return None if chip.overflows(self.netlist) else chip.chip_of(self.netlist)
 
     def effects(self, channels: EventArray, changes: Changes) -> Effects:
         """Only what a change reaches is simulated again."""
@@ -252,15 +252,17 @@ class Loihi(Damageable, Explainable, Stoppable):
             self._chip, kernel.known_run(self._chip, channels), self.netlist.classes, changes
         )
 
-    def forgetting(self, channels: EventArray) -> Forgetting | None:
+    def groups(
+        self, channels: EventArray, steps: int, decision: int, apart: IntArray, reach: int
+    ) -> Groups | None:
         """By interval arithmetic on registers."""
         if self._chip is None:
             return None
-        from spikeloom.runtime.machines.loihi1.changes import forgetting, kernel
+        from spikeloom.runtime.machines.loihi1.changes import boxes, kernel
 
-        return forgetting.forgetting(
-            self._chip, kernel.known_run(self._chip, channels), self.netlist.classes
-        )
+        shape = self.netlist.taxels * self.netlist.polarities, steps, self.netlist.classes
+        known = kernel.known_run(self._chip, channels)
+        return boxes.groups(self._chip, known, shape, decision, apart, reach)
 
     def core_map(self, events: EventArray, lengths: IntArray, counts: IntArray) -> CoreMap:
         """Cores on the mesh."""

@@ -18,7 +18,7 @@ from spikeloom.runtime.machines.changes import PART, Effects, joined, single
 from spikeloom.runtime.studies.robustness.definition import TAXEL, Exhaustive
 from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
 from spikeloom.runtime.studies.robustness.proofs.attack import attack
-from spikeloom.runtime.studies.robustness.proofs.bounds import lower_bound, needed
+from spikeloom.runtime.studies.robustness.proofs.bounds import APART, REACH, lower_bound, needed
 from spikeloom.runtime.studies.robustness.proofs.counting import Tally, least, tally_of
 from spikeloom.runtime.studies.robustness.proofs.entries import (
     Cells,
@@ -26,8 +26,17 @@ from spikeloom.runtime.studies.robustness.proofs.entries import (
     cells_of,
     channels_of,
 )
-from spikeloom.runtime.studies.robustness.results import PHASES, Certificate, Certificates, Decided
+from spikeloom.runtime.studies.robustness.results import (
+    PHASES,
+    Certificate,
+    Certificates,
+    Decided,
+    Evidence,
+)
 from spikeloom.runtime.studies.robustness.threads import in_threads
+
+EACH, ANY, NEAR = 1, 2, 3
+"""Rules of a certificate: each single event was run; bounds of groups, whatever came before; by their distance, too."""
 
 PROBED = 64
 """Single events whose time tells that of all."""
@@ -102,7 +111,7 @@ def certificate(
             kinds[kind.name], hanging = _decide_cases(machine, kind, events, shift, singles.decision)
             if kind.unit == TAXEL:
                 taxels[kind.name] = hanging
-    at_least, flips = _bounds(machine, singles, most)
+    at_least, flips, rule = _bounds(machine, singles, most)
     at_most = int(cells.cost[flips].sum()) or None
     steps = max(int(cells.cells[-1, 1]) + 1, 1)
     phase = cells.cells[singles.altering, 1] * PHASES // steps
@@ -119,6 +128,12 @@ def certificate(
         attack=tuple(cells.words_of(flip, machine.netlist) for flip in flips),
         taxels=taxels,
         phases=tuple(np.bincount(phase, minlength=PHASES).tolist()),
+        evidence=Evidence(
+            rule=rule,
+            unaltered=min(at_least, rule) if rule <= EACH else at_least,
+            bins=np.where(cells.there, cells.cost, 0).reshape(steps, -1).T,
+            changes=cells.cells[flips],
+        ),
     )
 
 
@@ -130,7 +145,7 @@ class _Singles:
     votes: IntArray
     cells: Cells
     counted: tuple[int, IntArray | None] | None  # What :func:`least` knows of a counting network
-    effects: Effects
+    effects: Effects | None  # None where no group of events alters the decision, so that none was run
     decided: IntArray  # By entry
 
     @property
@@ -149,16 +164,35 @@ def _flip_each(machine: Machine, events: Events, most: int, tally: Tally | None)
     channels = channels_of(events[None], machine.netlist)[0]
     votes = machine.votes(channels[None])[0]
     cells = cells_of(events, machine.netlist)
+    decision = int(votes.argmax())
     counted = None if tally is None else least(tally, channels != 0, votes, cells, most)
-    alike = np.arange(len(cells.cells))
-    if tally is not None and counted is not None:
-        alike = 2 * tally.groups(*cells.cells.T) + cells.there
-    _, first, those = np.unique(alike, return_index=True, return_inverse=True)
-    effects = machine.effects(channels, single(cells.cells[first]))
-    decided = (effects.votes + votes).argmax(axis=1)[those]
+    effects = None
+    if most == 1 and counted is None and _proven(machine, channels, votes, cells, 1) == {ANY: 1}:
+        decided = np.full(len(cells.cells), decision)
+    else:
+        alike = np.arange(len(cells.cells))
+        if tally is not None and counted is not None:
+            alike = 2 * tally.groups(*cells.cells.T) + cells.there
+        _, first, those = np.unique(alike, return_index=True, return_inverse=True)
+        effects = machine.effects(channels, single(cells.cells[first]))
+        decided = (effects.votes + votes).argmax(axis=1)[those]
     return _Singles(
         channels=channels, votes=votes, cells=cells, counted=counted, effects=effects, decided=decided
     )
+
+
+def _proven(machine: Machine, channels: Events, votes: IntArray, cells: Cells, most: int) -> dict[int, int]:
+    """Events, up to `most`, that are proven not to alter a decision, by rule; empty for a chip without bounds.
+
+    Of one event it does not ask how far groups are apart: that takes longer than to run each.
+    """
+    steps = int(cells.cells[-1, 1]) + 1
+    rules = {ANY: 1} if most == 1 else {ANY: 1, NEAR: len(APART)}
+    apart = APART[: max(rules.values())]
+    groups = machine.groups(channels, steps, int(votes.argmax()), apart, REACH)
+    if groups is None:
+        return {}
+    return {rule: lower_bound(votes, groups, apart[:spacings], most) for rule, spacings in rules.items()}
 
 
 def _decide_flips(machine: Machine, kind: Exhaustive, singles: _Singles) -> tuple[Decided, tuple[int, ...]]:
@@ -195,25 +229,35 @@ def _decide_cases(
     return decided_first, tuple(each[0] for each, _ in altering)
 
 
-def _bounds(machine: Machine, singles: _Singles, most: int) -> tuple[int, IntArray]:
-    """How many changed events alter nothing, and entries whose flips alter the decision, none if unknown."""
+def _bounds(machine: Machine, singles: _Singles, most: int) -> tuple[int, IntArray, int]:
+    """How many changed events alter nothing, entries whose flips alter the decision, none if unknown, and the rule."""
     cells = singles.cells
     flips = singles.altering[:1]
+    rule = EACH
     if len(flips):
-        at_least = 0
+        at_least = rule = 0
     elif singles.counted is not None:
         at_least, fewest = singles.counted
         flips = flips if fewest is None else fewest
-    elif (known := machine.forgetting(singles.channels)) is not None:
-        at_least = max(1, lower_bound(singles.votes, cells, singles.effects, known, most))
-        flips = attack(machine, singles.channels, singles.votes, cells, singles.effects)
+    elif singles.effects is None:
+        at_least, rule = 1, ANY
     else:
-        at_least = 1
+        at_least, flips, rule = _several(machine, singles, singles.effects, most)
     if len(flips):
         changed = machine.effects(singles.channels, joined([cells.cells[flips]])).votes + singles.votes
         if changed.argmax() == singles.decision:
             flips = flips[:0]
-    return at_least, flips
+    return at_least, flips, rule
+
+
+def _several(machine: Machine, singles: _Singles, effects: Effects, most: int) -> tuple[int, IntArray, int]:
+    """The same where no single event alters the decision; only these are known of a chip that has no bounds."""
+    proven = {} if most == 1 else _proven(machine, singles.channels, singles.votes, singles.cells, most)
+    if not proven:
+        return 1, np.zeros(0, np.int64), EACH
+    at_least = max(1, *proven.values())
+    rule = next((rule for rule, events in proven.items() if events == at_least), EACH)
+    return at_least, attack(machine, singles.channels, singles.votes, singles.cells, effects), rule
 
 
 def share_robust_to_one_event(machine: Machine, data: Recordings) -> float:

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from spikeloom.compiler import __version__
 from spikeloom.compiler.files import sha256_of
-from spikeloom.compiler.types import FloatArray
+from spikeloom.compiler.types import FloatArray, IntArray
 from spikeloom.runtime.inputs.recordings import name_of
 from spikeloom.runtime.report.encode import HIDDEN, OPTIONAL, key
 from spikeloom.runtime.report.shown import Shown
@@ -166,6 +166,16 @@ class Decided:
     least: int | None = None  # Bins of the smallest that does, where a kind has sizes
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Evidence:
+    """What a checker needs to see for itself that no `unaltered` events alter a decision, and that `changes` do."""
+
+    rule: int  # By which it can see that: 0 for nothing, see ``examples/check_certificate.py``
+    unaltered: int
+    bins: IntArray  # (channels, steps) int64; bins of the recording that are set in each step of the network
+    changes: IntArray  # (changes, 2) int64; channel and step
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Certificate:
     """What is proven and known of one recording.
@@ -186,6 +196,7 @@ class Certificate:
     attack: tuple[str, ...]
     taxels: Mapping[str, tuple[int, ...]]
     phases: tuple[int, ...]
+    evidence: Evidence | None = field(default=None, metadata=HIDDEN, compare=False)
 
     @property
     def right(self) -> bool:

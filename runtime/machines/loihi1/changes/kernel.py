@@ -11,12 +11,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
-from scipy import sparse
 
 from spikeloom.compiler.layer_kernel import (
-    Synapses,
-    by_source,
     charged,
     clear,
     compiled,
@@ -28,50 +24,11 @@ from spikeloom.compiler.layer_kernel import (
     require_below,
     saturated,
 )
-from spikeloom.compiler.targets.loihi1.bounds import reach
-from spikeloom.compiler.targets.loihi1.netlist import Netlist
-from spikeloom.compiler.targets.loihi1.registers import (
-    ACCUMULATOR_MAX,
-    CURRENT_MAX,
-    MEMBRANE_MAX,
-    MEMBRANE_SHIFT,
-)
-from spikeloom.compiler.types import IntArray
+from spikeloom.compiler.targets.loihi1.registers import MEMBRANE_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.types import AnyArray, IntArray
 from spikeloom.runtime.machines.changes import Changes, Effects
-
-AnyArray = npt.NDArray[Any]
-
-LANES = 64
-"""Places of a block; each layer begins one."""
-
-NEVER = 2**31 - 1
-"""Threshold of a place without a compartment."""
-
-
-class Chip(NamedTuple):
-    """A netlist as the kernel reads it: places of compartments by layer and neuron, in blocks; none is at some."""
-
-    synapses: Synapses  # Of the input channels, then of each place
-    depth: IntArray  # (blocks,) int64
-    # keep_u, keep_v, threshold, bias, lowest: (places,) int32; decays in 1/4096, then membrane units; no
-    # membrane is below the lowest
-    keep_u: AnyArray
-    keep_v: AnyArray
-    threshold: AnyArray
-    bias: AnyArray
-    lowest: AnyArray
-    label: AnyArray  # (places,) int32; class that a spike votes for, -1 for none
-
-
-class Known(NamedTuple):
-    """A run; of `steps` chip steps."""
-
-    events: AnyArray  # (channels, T) uint8, 0 or 1
-    sums: AnyArray  # (steps, places) int32; net synaptic sums
-    # current, membrane: (steps + 1, places) int32; registers before each step, and after the last
-    current: AnyArray
-    membrane: AnyArray
-    fired: AnyArray  # (steps, places) uint8
+from spikeloom.runtime.machines.loihi1.changes.chip import LANES, Chip, Known
+from spikeloom.runtime.machines.loihi1.changes.safe import Safe, safe, unsafe
 
 
 class _Run(NamedTuple):
@@ -89,38 +46,6 @@ class _Run(NamedTuple):
     # moved, sign: int64; sources whose events differ, and whether these come (1) or go (-1)
     moved: IntArray
     sign: IntArray
-
-
-def overflows(netlist: Netlist) -> bool:
-    """Whether some input could bring a sum or a current that its register does not hold."""
-    reached = reach(netlist)
-    return bool(np.any(reached.sums > ACCUMULATOR_MAX) or np.any(reached.current > CURRENT_MAX))
-
-
-def chip_of(netlist: Netlist) -> Chip:
-    """Lay a netlist out."""
-    order = np.lexsort((netlist.neuron, netlist.layer))
-    sizes = np.bincount(netlist.layer, minlength=len(netlist.layers))
-    blocks = -(-sizes // LANES)
-    shift = LANES * (np.cumsum(blocks) - blocks) - (np.cumsum(sizes) - sizes)
-    place = order.argsort() + shift[netlist.layer]
-    places = LANES * int(blocks.sum())
-    source = np.append(np.arange(netlist.n_inputs), netlist.n_inputs + place)[netlist.axon_source]
-    pairs = place[netlist.synapse_compartment()], source[netlist.axon_of_synapse()]
-    weight = sparse.csr_array((netlist.effective_weight(), pairs), shape=(places, netlist.n_inputs + places))
-    columns = {
-        "keep_u": (netlist.keep_u, 0),
-        "keep_v": (netlist.keep_v, 0),
-        "threshold": (netlist.threshold << MEMBRANE_SHIFT, NEVER),
-        "bias": (netlist.bias, 0),
-        "lowest": (-np.minimum(reach(netlist).stored, MEMBRANE_MAX), 0),
-        "label": (netlist.readout_class, -1),
-    }
-    laid = {name: np.full(places, missing, np.int32) for name, (_, missing) in columns.items()}
-    for name, (values, _) in columns.items():
-        laid[name][place] = values
-    depth = np.repeat([layer.depth for layer in netlist.layers], blocks)
-    return Chip(by_source([weight], np.int32), depth, **laid)
 
 
 def known_run(chip: Chip, events: AnyArray) -> Known:
@@ -144,7 +69,7 @@ def effects(chip: Chip, known: Known, classes: int, changes: Changes) -> Effects
     channel, step = np.ascontiguousarray(changes.cells.T, np.int64)
     require_below("channel", channel, known.events.shape[0])
     require_below("step", step, known.events.shape[1])
-    _run(chip, known, _run_of(chip, known), channel, step, changes.bounds, *made)
+    _run(chip, known, safe(chip, known), _run_of(chip, known), channel, step, changes.bounds, *made)
     return made
 
 
@@ -168,7 +93,8 @@ def _charge(current: Any, keep: Any, sums: Any, delta: Any, first: Any, places: 
 
 
 @compiled
-def _integrate(membrane: Any, keep: Any, current: Any, bias: Any, first: Any, places: Any) -> None:
+def integrate(membrane: Any, keep: Any, current: Any, bias: Any, first: Any, places: Any) -> None:
+    """Let membranes of some places decay and take in currents and biases."""
     for i in range(first, first + places):
         v = integrated(decayed(membrane[i], keep[i]), current[i], bias[i])
         membrane[i] = saturated(v, np.int32(MEMBRANE_MAX))
@@ -225,7 +151,7 @@ def _step(chip: Chip, run: Any, sums: Any, first: Any, places: Any) -> None:
     """Charge and integrate some places; the sums of `run` are used up."""
     _charge(run.current, chip.keep_u, sums, run.delta, first, places)
     clear(run.delta[first : first + places])
-    _integrate(run.membrane, chip.keep_v, run.current, chip.bias, first, places)
+    integrate(run.membrane, chip.keep_v, run.current, chip.bias, first, places)
 
 
 @compiled_and_cached
@@ -296,9 +222,29 @@ def _part(
     return moved, any_held
 
 
+@compiled
+def _over(chip: Chip, known: Known, bounds: Safe, run: Any, t: Any) -> Any:
+    """Whether all that differs is safe, so that spikes are the known ones from here on."""
+    for block in range(len(chip.depth)):
+        if run.held[block] and unsafe(
+            chip, known, bounds, (run.current, run.current, run.membrane, run.membrane), t, block
+        ):
+            return False
+    return True
+
+
 @compiled_and_cached
 def _run(
-    chip: Chip, known: Known, run: Any, channel: Any, step: Any, bounds: Any, come: Any, gone: Any, end: Any
+    chip: Chip,
+    known: Known,
+    bounds_: Safe,
+    run: Any,
+    channel: Any,
+    step: Any,
+    bounds: Any,
+    come: Any,
+    gone: Any,
+    end: Any,
 ) -> None:
     steps = len(known.sums)
     blocks = len(chip.depth)
@@ -310,7 +256,7 @@ def _run(
         t = np.int64(0)
         clear(run.held)
         while True:
-            if moved == 0 and not any_held:
+            if moved == 0 and (not any_held or (flip == last and _over(chip, known, bounds_, run, t))):
                 end[k] = t
                 if flip == last:
                     break

@@ -1,14 +1,9 @@
 """How many events must at least change until a decision does: a sound lower bound, by what the chip forgets.
 
-Changes of events come one after another. As soon as the chip is in the state that it would be in anyway,
-what follows is as if nothing had been: effects of events so far apart add up, and each of them is known
-exactly. Where a further event changes before that, nothing is assumed but what :class:`Forgetting` knows:
-every vote that is open may go the wrong way. A dynamic program over steps and events finds the worst of
-all. Votes may be lost
-
-*exactly*: by a change whose run is the known one before the next change;
-*in a cluster*: by its first change at most as many as its own effects hold, until the second shows; by each further one
-    those that are open between the first step that it can alter and the first that the next can alter.
+Changed events come in groups, one a step. The votes from where a group can be seen until the next can be are
+lost to this group. How many they are at most, :class:`Groups` says, by how long ago the group before it was:
+nothing more is assumed of the past. A dynamic program over steps, spacings and events finds the worst of all.
+Each vote is counted for one group; those before the first group can be seen are the known ones.
 """
 
 from __future__ import annotations
@@ -16,8 +11,13 @@ from __future__ import annotations
 import numpy as np
 
 from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.changes import Effects, Forgetting
-from spikeloom.runtime.studies.robustness.proofs.entries import Cells
+from spikeloom.runtime.machines.changes import Groups
+
+APART = np.array([1, 5, 7])
+"""Steps from a group to the one before it, at least, for which bounds are worked out."""
+
+REACH = 12
+"""Steps to the next group that are told apart; no less than the last of these."""
 
 
 def needed(votes: IntArray) -> tuple[int, IntArray]:
@@ -32,41 +32,17 @@ def needed(votes: IntArray) -> tuple[int, IntArray]:
     return decision, gaps
 
 
-def lower_bound(votes: IntArray, cells: Cells, effects: Effects, known: Forgetting, most: int) -> int:
-    """Most events, up to `most`, of which it is proven that no so many alter the decision of a recording.
-
-    `votes` (classes,) are those of the known run, `effects` those of each entry flipped alone.
-    """
-    from spikeloom.compiler.layer_kernel import require_below
+def lower_bound(votes: IntArray, groups: Groups, apart: IntArray, most: int) -> int:
+    """Most events, up to `most`, of which it is proven that no so many alter the decision of votes (classes,)."""
     from spikeloom.runtime.studies.robustness.proofs.worst import (
         most_lost,
     )  # with numba, which help need not wait for
 
     decision, gaps = needed(votes)
-    steps = len(known.back) - 1
-    step = cells.cells[:, 1]
-    first = np.searchsorted(step, np.arange(steps + 1))
-    end = np.minimum(effects.end, steps)
-    for name, indices in (("quiet", known.quiet), ("back", known.back)):
-        require_below(name, indices, steps + 1)
     certified = most
-    for other in np.flatnonzero(np.arange(len(votes)) != decision).tolist():
-        alone = effects.votes[:, other] - effects.votes[:, decision]
-        partly = effects.come[:, other] + effects.gone[:, decision]
-        opened = known.come[:, :, other].astype(np.int64) + known.gone[:, :, decision]
-        votes_lost = most_lost(
-            first,
-            end,
-            cells.cost,
-            alone,
-            partly,
-            known.quiet,
-            known.back,
-            opened,
-            known.lag,
-            min(certified, most),
-        )
-        certified = min(certified, int(np.searchsorted(votes_lost, gaps[other])) - 1)
-        if certified <= 0:
-            return 0
+    for other in np.argsort(gaps, kind="stable").tolist():
+        if other != decision and certified > 0:
+            of_class = np.ascontiguousarray(groups.lost[: len(apart), ..., other])
+            lost = most_lost(of_class, apart, certified)
+            certified = min(certified, int(np.searchsorted(lost, gaps[other])) - 1)
     return certified

@@ -1,0 +1,388 @@
+"""Check what ``spikeloom certify --certificate`` wrote; of spikeloom nothing is needed, only numpy.
+
+    python check_certificate.py NETLIST.loom CERTIFICATE
+
+A certificate holds recordings and says of each: the chip decides *so*; no k events alter that; these events do. An
+event is a channel's bin that is set; a change sets one or clears one. All of it is derived again from the netlist,
+whose hash is compared, and the chip's integers. Only these rules are used:
+
+*An alteration* is run. *One event*: all runs with one change are run side by side. Two in the same state (registers,
+spikes on their way) go on alike, so one of them stands for both, with the worse votes of the two.
+
+*k events* (Loihi). Let events change at the steps t1 < t2 < …; those of a step are a *group*. A vote sees an event `lag`
+steps later at the earliest: votes before t1 + lag are the known ones, those from ti + lag to ti+1 + lag do not depend on
+groups after i. ``turned`` bounds how many of these can turn, whatever came before group i - 1, by interval arithmetic:
+from all registers that any input can bring about, through known events, the group, known events again. Sums, decay,
+saturation and comparison are monotone, a reset cuts off at the threshold: no run ever leaves its bounds. The bounds are
+followed until all membranes are such that with the known events every spike is the known one, for ever (``safe``; found
+backwards). ``none_of`` adds up the worst over all steps, distances and sizes of groups of k events in all. If no class
+can make up for what it lacks, no k events alter the decision.
+"""
+
+import hashlib
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+LIMIT = 2**23 - 1  # of currents and membranes
+FAR = 2**40
+APART = [1, 5, 7]  # steps between groups that rule 3 tells apart
+REACH = 12  # steps to the next group that are told apart
+HORIZON = 32  # steps for which bounds are followed; of the rest all votes may turn
+
+
+def require(holds, what):
+    """Refuse what does not hold."""
+    if not holds:
+        raise SystemExit(f"refused: {what}")
+
+
+def load(path):
+    """Manifest and whole numbers of a file; nothing in it is executed."""
+    with np.load(path, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    about = json.loads(str(arrays.pop("manifest")))
+    return about, {name: each.astype(np.int64) for name, each in arrays.items() if each.dtype.kind == "i"}
+
+
+def parts(bounds):
+    """Part of each entry of range bounds."""
+    return np.repeat(np.arange(len(bounds) - 1), np.diff(bounds))
+
+
+def decayed(value, keep):
+    """``value * keep / 4096`` toward zero."""
+    return np.sign(value) * (np.abs(value) * keep >> 12)
+
+
+def largest(most, keep):
+    """Largest value of which at most `most` is kept."""
+    k = np.maximum(keep, 1)
+    found = np.where(most >= 0, ((most + 1) * 4096 - 1) // k, -((-most * 4096 + k - 1) // k))
+    return np.clip(np.where(keep > 0, found, np.where(most >= 0, FAR, -FAR)), -FAR, FAR)
+
+
+class Chip:
+    """Synapses by source (input channels and compartments, or axons), and who votes for what."""
+
+    def connect(self, source, target, weight, sources, label, classes):
+        """Keep them."""
+        order = np.argsort(source, kind="stable")
+        self.target, self.weight = target[order], weight[order]
+        self.first = np.searchsorted(source[order], np.arange(sources + 1))
+        self.label, self.classes, self.neurons = label, classes, len(label)
+
+    def sums(self, sure, may):
+        """Least and largest sums (rows, neurons), by sources (rows, sources) that spike surely, and that may."""
+        differ = (sure != sure[0]) | (may != may[0])  # few do: rows are summed up from the first on
+        differ[0] = may[0]
+        row, source = np.nonzero(differ)
+        length = self.first[source + 1] - self.first[source]
+        entry = np.repeat(np.arange(len(source)), length)
+        at = np.arange(len(entry)) + (self.first[source] - np.cumsum(length) + length)[entry]
+        row, source, weight = row[entry], source[entry], self.weight[at]
+        place = row * self.neurons + self.target[at]
+        ends = []
+        for end in (np.minimum, np.maximum):
+            each, first = (
+                weight * on + end(weight, 0) * (maybe & ~on)
+                for on, maybe in ((sure[row, source], may[row, source]), (sure[0, source], may[0, source]))
+            )
+            added = np.bincount(place, each - (row > 0) * first, len(sure) * self.neurons)
+            ends.append(added.astype(np.int64).reshape(len(sure), -1))
+            ends[-1][1:] += ends[-1][0]
+        return ends
+
+    def votes(self, fired):
+        """Votes by class of spikes (rows, neurons)."""
+        return np.stack([fired[:, self.label == each].sum(axis=1) for each in range(self.classes)], axis=1)
+
+
+class Loihi(Chip):
+    """State: least and largest current, the same of the membrane, and who spiked surely, and may have."""
+
+    bin_ticks = 1
+
+    def __init__(self, about, a):
+        require(not about.get("blank"), "a free-running netlist")
+        axon = parts(a["axon_synapses"])
+        exponent, mantissa = a["format_exponent"][a["axon_format"][axon]], a["synapse_weight"]
+        weight = np.where(exponent < 0, mantissa >> 1, mantissa << np.maximum(exponent, 0))
+        target = a["core_compartments"][parts(a["core_axons"])][axon] + a["synapse_target"]
+        self.channels = about["taxels"] * about["polarities"] + about["clocks"]["channels"]
+        source, n = a["axon_source"][axon], len(a["layer"])
+        self.connect(source, target, weight, self.channels + n, a["readout_class"], about["classes"])
+        self.keep_u, self.keep_v = 4095 - a["decay_u"], 4096 - a["decay_v"]
+        self.threshold, self.bias = a["threshold"] << 6, a["bias_mantissa"] << a["bias_exponent"]
+        self.depth = np.array([layer["depth"] for layer in about["layers"]])[a["layer"]]
+        self.drain = int(self.depth.max())
+        up, down = (64 * np.bincount(target, (s * weight).clip(0), n).astype(np.int64) for s in (1, -1))
+        self.most = [each * 4096 // (4096 - self.keep_u) for each in (-down, up)]  # currents, whatever the input
+        overflows = (np.maximum(up, down) >= 2**21) | (np.abs(self.most).max(axis=0) > LIMIT)
+        require(not overflows.any(), "a register may overflow")
+
+    def start(self, steps):
+        """At rest, for a recording of so many steps."""
+        self.steps = steps
+        return [*np.zeros((4, 1, self.neurons), np.int64), *np.zeros((2, 1, self.neurons), np.bool_)]
+
+    def tick(self, state, seen, t):
+        """Bounds of all rows a step on, and the least and most votes; `seen` are the events, sure and possible."""
+        box, fired = list(state[:4]), state[4:]
+        inside = (self.depth <= t) & (t < self.depth + self.steps)
+        sums = self.sums(*(np.concatenate(each, axis=1) for each in zip(seen, fired, strict=True)))
+        for end in (0, 1):
+            u = np.clip(decayed(box[end], self.keep_u) + 64 * sums[end], -LIMIT, LIMIT) * inside
+            v = decayed(box[2 + end], self.keep_v) + u + self.bias
+            box[end], box[2 + end] = u, np.clip(v, -LIMIT, LIMIT) * inside
+        sure, may = box[2] > self.threshold, box[3] > self.threshold
+        box[2] = np.where(sure, 0, np.where(may, np.minimum(box[2], 0), box[2]))
+        box[3] = np.where(sure, 0, np.where(may, self.threshold, box[3]))
+        return [*box, sure, may], (self.votes(sure), self.votes(may))
+
+    def unknown(self, begin, least):
+        """Whatever any input can have brought about before a step."""
+        inside = ((self.depth < begin) & (begin <= self.depth + self.steps))[None]
+        u = [each * (self.keep_u > 0) * inside for each in self.most]
+        return [*u, least * inside, self.threshold * inside, inside & False, inside]
+
+
+class TrueNorth(Chip):
+    """State: membrane, and the axons that spikes reach in this tick and the next ones."""
+
+    def __init__(self, about, a):
+        axon, core = parts(a["axon_synapses"]), parts(a["core_axons"])
+        neuron = a["core_neurons"][core[axon]] + a["synapse_neuron"]
+        weight = a["weight"][neuron, a["axon_type"][axon]]
+        self.connect(axon, neuron, weight, len(core), a["readout_class"], about["classes"])
+        self.a, self.bin_ticks = a, about["bin_ticks"]
+        line = {pair: n for n, pair in enumerate(zip(core.tolist(), a["axon_line"].tolist(), strict=True))}
+        place = {xy: n for n, xy in enumerate(zip(a["core_x"].tolist(), a["core_y"].tolist(), strict=True))}
+        wires = zip(a["wire_x"].tolist(), a["wire_y"].tolist(), strict=True)
+        a["wire_core"] = np.array([place[xy] for xy in wires], np.int64)
+        self.feed, self.clock, self.wire = (
+            np.array(
+                [line[at] for at in zip(*(a[f"{k}_{n}"].tolist() for n in ("core", "line")), strict=True)],
+                int,
+            )
+            for k in ("feed", "clock", "wire")
+        )
+        self.drain = int(a["readout_first"][self.label >= 0].max(initial=0))
+        self.ahead = 1 + int(max(a["feed_tick"].max(initial=0), a["wire_delay"].max(initial=1)))
+
+    def start(self, steps):
+        """Initial membranes."""
+        self.steps = steps
+        return [self.a["initial"][None], np.zeros((1, self.ahead, len(self.first) - 1), np.bool_)]
+
+    def tick(self, state, seen, t):
+        """All rows a tick on, and their votes twice."""
+        a, v, due = self.a, state[0], state[1].copy()
+        row, feed = np.nonzero(seen[0][:, a["feed_channel"]])
+        due[row, a["feed_tick"][feed], self.feed[feed]] = True
+        late = t - a["clock_phase"]
+        due[:, 0, self.clock[(late >= 0) & (late % a["clock_period"] == 0)]] = True
+        low, high = -(2**19), 2**19 - 1
+        v = np.clip(v + self.sums(due[:, 0], due[:, 0])[0], low, high)
+        towards = np.where(a["leak_reversal"], np.sign(v), 1)
+        leaked = v + towards * a["leak"]
+        v = np.clip(np.where(a["leak_reversal"] & (leaked * towards < 0), 0, leaked), low, high)
+        fired, floor = v >= a["threshold"], a["negative_threshold"]
+        to, by = a["reset_mode"] == 0, a["reset_mode"] == 1
+        up = np.where(to, a["reset"], np.where(by, v - a["threshold"], v))
+        down = np.where(
+            a["negative_saturates"], -floor, np.where(to, -a["reset"], np.where(by, v + floor, v))
+        )
+        v = np.clip(np.where(fired, up, np.where(v < -floor, down, v)), low, high)
+        due = np.concatenate([due[:, 1:], np.zeros_like(due[:, :1])], axis=1)
+        row, wire = np.nonzero(fired[:, a["wire_neuron"]])
+        due[row, a["wire_delay"][wire] - 1, self.wire[wire]] = True
+        counts = (a["readout_first"] <= t) & (t < a["readout_first"] + self.steps * self.bin_ticks)
+        return [v, due], (self.votes(fired & counts),) * 2
+
+
+def run(chip, events, flips, decision):
+    """States before each tick and votes in it of a recording (channels, steps), and whether a flip alone alters it.
+
+    `flips` (channels, steps) are the entries that are changed, each alone.
+    """
+    state, counts = chip.start(events.shape[1]), []
+    states = [state]
+    ahead = np.zeros((1, chip.classes), np.int64)  # votes beyond those of the decision
+    over = np.zeros(
+        chip.classes, np.int64
+    )  # the same of runs that have become the known one, beyond its own
+    for t in range(events.shape[1] * chip.bin_ticks + chip.drain):
+        step, later = divmod(t, chip.bin_ticks)
+        seen = np.zeros((len(ahead), len(events)), np.bool_)
+        if not later and step < events.shape[1]:
+            more = np.flatnonzero(flips[:, step])
+            rows = np.append(np.arange(len(ahead)), np.zeros(len(more), int))
+            state, ahead = [each[rows] for each in state], ahead[rows]
+            seen = np.repeat(events[None, :, step], len(rows), axis=0)
+            seen[len(rows) - len(more) + np.arange(len(more)), more] ^= True
+        state, (votes, _) = chip.tick(state, (seen, seen), t)
+        ahead = ahead + votes - votes[:, [decision]]
+        alike = {}
+        of = [alike.setdefault(b"".join(each[k].tobytes() for each in state), k) for k in range(len(ahead))]
+        kept, of = np.unique(of, return_inverse=True)
+        over = np.maximum(over, (ahead[of == 0] - ahead[0]).max(axis=0))
+        worst = np.full((len(kept), chip.classes), -FAR)
+        np.maximum.at(worst, of, ahead)
+        worst[0] = ahead[0]
+        state, ahead = [each[kept] for each in state], worst
+        states.append([each[:1] for each in state])
+        counts.append(votes[0])
+    wins = np.maximum(ahead.max(axis=0), ahead[0] + over) >= 1 * (np.arange(chip.classes) > decision)
+    return states, np.array(counts), bool(np.delete(wins, decision).any())
+
+
+def safe(chip, states):
+    """Least and largest membrane before each step from which, the events known, all spikes are the known ones."""
+    ends = [(np.full(chip.neurons, -FAR), np.full(chip.neurons, FAR))]
+    for t in reversed(range(len(states) - 1)):
+        more, fired = states[t + 1][0][0] + chip.bias, states[t + 1][4][0]
+        least = np.where(fired, chip.threshold + 1, ends[-1][0])
+        most = np.where(fired, FAR, np.minimum(chip.threshold, ends[-1][1]))
+        low = np.where(least <= -LIMIT, -FAR, -largest(more - least, chip.keep_v))
+        high = np.where(most >= LIMIT, FAR, largest(most - more, chip.keep_v))
+        inside = (chip.depth <= t) & (t < chip.depth + chip.steps)
+        ends.append((np.where(inside, low, -FAR), np.where(inside, high, FAR)))
+    return ends[::-1]
+
+
+class Bounds:
+    """What groups of changed events can turn in one recording."""
+
+    def __init__(self, chip, events, flips, decision, states, counts):
+        self.chip, self.events, self.flips, self.decision = chip, events, flips, decision
+        self.states, self.counts, self.safe = states, counts, safe(chip, states)
+        self.least = np.zeros(chip.neurons, np.int64)  # no membrane is below that, whatever the input
+        for _ in counts:
+            sunk = decayed(self.least, chip.keep_v) + chip.most[0] + np.minimum(chip.bias, 0)
+            self.least = np.maximum(sunk, -LIMIT)
+        reached, self.lag = np.arange(chip.channels + chip.neurons) < chip.channels, -1
+        while self.lag < len(counts) and not (chip.label[reached[chip.channels :]] >= 0).any():
+            low, high = chip.sums(reached[None] & False, reached[None])
+            reached[chip.channels :] |= (low[0] < 0) | (high[0] > 0)
+            self.lag += 1
+
+    def turned(self, t, far, reach):
+        """Votes that each class gains on the decision until the next group comes 1 … `reach` steps later, or never.
+
+        The group is of step `t`, the one before it at least `far` steps ago. By (one event or more, reach, classes).
+        """
+        chip, source = self.chip, np.flatnonzero(self.flips[:, t])
+        begin, rows = max(t - far + 1, 0), 1 if far == 1 else 1 + len(source)
+        state = chip.unknown(begin, self.least) if begin else self.states[t]
+        table, lost = np.zeros((rows, reach, chip.classes), int), np.zeros((rows, chip.classes), int)
+        for s in range(begin or t, len(self.counts)):
+            now = self.events[None, :, s] if s < self.events.shape[1] else np.zeros((1, chip.channels), bool)
+            sure, may = (np.repeat(now, 1 if s < t else rows, axis=0) for _ in range(2))
+            if s == t:
+                state = [np.repeat(each, rows, axis=0) for each in state]
+                sure[0, source], may[0, source] = False, True
+                for k in range(1, rows):
+                    sure[k, source[k - 1]] = may[k, source[k - 1]] = not now[0, source[k - 1]]
+            state, (fewest, most) = chip.tick(state, (sure, may), s)
+            r = s + 1 - t - self.lag
+            if r > 0:
+                lost = (
+                    lost
+                    + (self.counts[s, self.decision] - fewest[:, [self.decision]])
+                    + most
+                    - self.counts[s]
+                )
+                if s + 1 == t + HORIZON:
+                    rest = self.counts[s + 1 :]
+                    voters = np.bincount(chip.label[chip.label >= 0], minlength=chip.classes)
+                    lost += rest[:, self.decision].sum() + (voters - rest).sum(axis=0)
+                table[:, min(r, reach) - 1 :] = np.maximum(
+                    lost[:, None], table[:, -1:] if r >= reach else -FAR
+                )
+            known, (low, high) = self.states[s + 1], self.safe[s + 1]
+            over = (state[2] >= low) & (state[3] <= high) & (state[4] == known[4]) & (state[5] == known[5])
+            over &= (chip.keep_u == 0) | ((state[0] == known[0]) & (state[1] == known[1]))
+            if s >= t and (over.all() or s + 1 == t + HORIZON):
+                break
+        return table[[0, 0]] if rows == 1 else np.stack([table[1:].max(axis=0), table[0]])
+
+    def none_of(self, k, apart):
+        """Whether no `k` events alter the decision, by how far groups are `apart` at least (rising from 1)."""
+        steps, classes = self.flips.shape[1], self.chip.classes
+        reach = REACH
+        # votes lost to groups before one at a step, by its distance to the last of them and events so far
+        enter = np.full((steps + reach, len(apart), k + 1, classes), -FAR)
+        enter[:, -1, 0] = 0
+        worst = np.zeros((k + 1, classes), np.int64)
+        for t in np.flatnonzero(self.flips.any(axis=0)):
+            for level, far in enumerate(apart):
+                for events, lost in enumerate(self.turned(t, far, reach)[: min(k, 2)], 1):
+                    after = enter[t, level, : k + 1 - events, None] + lost
+                    for r in range(1, reach):
+                        to = enter[t + r, sum(each <= r for each in apart) - 1, events:]
+                        np.maximum(to, after[:, r - 1], out=to)
+                    to = enter[t + reach :, -1, events:]
+                    np.maximum(to, after[:, -1], out=to)
+                    np.maximum(worst[events:], after[:, -1], out=worst[events:])
+        votes = self.counts.sum(axis=0)
+        needed = votes[self.decision] - votes + (np.arange(classes) > self.decision)
+        return bool(np.delete(worst.max(axis=0) < needed, self.decision).all())
+
+
+def check(chip, events, bins, claim):
+    """Hold the claims about one recording against the chip; `bins` (channels, steps) are those set in each step."""
+    decision, k, rule, changes = claim
+    flips = np.zeros(events.shape, np.bool_)
+    none, single = flips.copy(), flips.copy()
+    flips[: len(bins), : bins.shape[1]] = True
+    single[: len(bins), : bins.shape[1]] = bins <= 1
+    states, counts, alters = run(chip, events, single if rule == 1 else none, decision)
+    require(counts.sum(axis=0).argmax() == decision, "the decision")
+    require(
+        rule in (0, 1, 2, 3) and k <= {0: 0, 1: 1}.get(rule, k),
+        f"{k} events, which rule {rule} cannot prove",
+    )
+    require(not alters, "that no single event alters the decision")
+    if rule > 1:
+        require(isinstance(chip, Loihi), f"rule {rule}, which is for Loihi")
+        bounds = Bounds(chip, events, flips[:, : bins.shape[1]], decision, states, counts)
+        require(bounds.none_of(k, [1] if rule == 2 else APART), f"that no {k} events alter the decision")
+    if len(changes):
+        channel, step = changes.T
+        require(flips[channel, step].all(), "changes of entries that the recording does not have")
+        changed = events.copy()
+        changed[channel, step] ^= True
+        votes = run(chip, changed, none, decision)[1].sum(axis=0)
+        require(votes.argmax() != decision, "that the changes named alter the decision")
+    return int(np.maximum(bins[tuple(changes.T)], 1).sum())
+
+
+def main(netlist, certificate):
+    """Check all claims; the first that does not hold ends it."""
+    about, arrays = load(certificate)
+    require(about.get("format") == "spikeloom-certificate" and about.get("version") == 1, "the format")
+    found = hashlib.sha256(Path(netlist).read_bytes()).hexdigest()
+    require(found == about["netlist_sha256"], f"a certificate of another netlist, {about['netlist_sha256']}")
+    network, cores = load(netlist)
+    chip = {"loihi1": Loihi, "truenorth": TrueNorth}[network["target"]](network, cores)
+    clocks, bounds, ends = network["clocks"], arrays["step_bounds"], arrays["change_bounds"]
+    print(f"{netlist}: as certified; {len(about['files'])} recordings")
+    for n, file in enumerate(about["files"]):
+        bins = arrays["bins"][:, bounds[n] : bounds[n + 1]]
+        steps = clocks.get("length") or bins.shape[1]
+        bins = bins[:, :steps]
+        events = np.zeros((len(bins) + clocks["channels"], steps), np.bool_)
+        events[: len(bins), : bins.shape[1]] = bins > 0
+        ticking = np.arange(steps) // clocks["steps"] == np.arange(clocks["channels"])[:, None]
+        events[len(bins) :] = ticking
+        claim = [int(arrays[name][n]) for name in ("decision", "unaltered", "rule")]
+        cost = check(chip, events, bins, (*claim, arrays["changes"][ends[n] : ends[n + 1]]))
+        altered = f"; {cost} alter it" if cost else ""
+        print(f"{file}: decides {claim[0]}; no {claim[1]} events alter that{altered}", flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
