@@ -3,20 +3,23 @@
     python check_certificate.py NETLIST.loom CERTIFICATE
 
 A certificate holds recordings and says of each: the chip decides *so*; no k events alter that; these events do. An
-event is a channel's bin that is set; a change sets one or clears one. All of it is derived again from the netlist,
-whose hash is compared, and the chip's integers. Only these rules are used:
+event is a bin of a channel that is set, and a change sets one or clears one. Nothing of it is believed: all is derived
+again from the netlist, whose hash is compared, and the chip's integers, by these rules.
 
 *An alteration* is run. *One event*: all runs with one change are run side by side. Two in the same state (registers,
-spikes on their way) go on alike, so one of them stands for both, with the worse votes of the two.
+and spikes on their way) go on alike, so one of them stands for both, with the most votes of either for each class
+beyond those of the decision.
 
-*k events* (Loihi). Let events change at the steps t1 < t2 < …; those of a step are a *group*. A vote sees an event `lag`
-steps later at the earliest: votes before t1 + lag are the known ones, those from ti + lag to ti+1 + lag do not depend on
-groups after i. ``turned`` bounds how many of these can turn, whatever came before group i - 1, by interval arithmetic:
-from all registers that any input can bring about, through known events, the group, known events again. Sums, decay,
-saturation and comparison are monotone, a reset cuts off at the threshold: no run ever leaves its bounds. The bounds are
-followed until all membranes are such that with the known events every spike is the known one, for ever (``safe``; found
-backwards). ``none_of`` adds up the worst over all steps, distances and sizes of groups of k events in all. If no class
-can make up for what it lacks, no k events alter the decision.
+*k events* (Loihi). Let events change at the steps t1 < t2 < …; those of one step are a *group*. A vote sees an event
+`lag` steps later at the earliest. So votes before t1 + lag are the known ones, and those from ti + lag to before
+ti+1 + lag depend on no group after i. ``turned`` bounds how many of these can turn, whatever there was until group
+i - 1: interval arithmetic from all registers that any input can bring about, through the known events between the
+groups, the group (its one change, or any), and known events again. Decay, sums, saturation and comparison are
+monotone, and a reset leaves zero or what is below the threshold, so no run leaves its bounds. They are followed until
+every membrane is where known events make every spike the known one for ever (``safe``: an interval, found backwards).
+``none_of`` adds the worst of all steps, distances and sizes of groups that have k events together; the distance to the
+group before decides what is known, that to the next how many votes count. If no class makes up for what it lacks, no
+k events alter the decision.
 """
 
 import hashlib
@@ -119,7 +122,9 @@ class Loihi(Chip):
         self.depth = np.array([layer["depth"] for layer in about["layers"]])[a["layer"]]
         self.drain = int(self.depth.max())
         up, down = (64 * np.bincount(target, (s * weight).clip(0), n).astype(np.int64) for s in (1, -1))
-        self.most = [each * 4096 // (4096 - self.keep_u) for each in (-down, up)]  # currents, whatever the input
+        self.most = [
+            each * 4096 // (4096 - self.keep_u) for each in (-down, up)
+        ]  # currents, whatever the input
         overflows = (np.maximum(up, down) >= 2**21) | (np.abs(self.most).max(axis=0) > LIMIT)
         require(not overflows.any(), "a register may overflow")
 
@@ -352,7 +357,8 @@ def check(chip, events, bins, claim):
         require(bounds.none_of(k, [1] if rule == 2 else APART), f"that no {k} events alter the decision")
     if len(changes):
         channel, step = changes.T
-        require(flips[channel, step].all(), "changes of entries that the recording does not have")
+        within = np.all((changes >= 0) & (changes < bins.shape))
+        require(within, "changes of entries that the recording does not have")
         changed = events.copy()
         changed[channel, step] ^= True
         votes = run(chip, changed, none, decision)[1].sum(axis=0)

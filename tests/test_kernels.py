@@ -10,14 +10,12 @@ from zoo import specimen
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.interpret import float_simulation
 from spikeloom.models.networks.layers import spike_linear
-from spikeloom.runtime.machines.changes import Forgetting, single
+from spikeloom.runtime.machines.changes import single
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.changes import kernel
 from spikeloom.runtime.machines.loihi1.changes.chip import chip_of
 from spikeloom.runtime.machines.loihi1.costs import timing
 from spikeloom.runtime.machines.truenorth import engine as crossbars
-from spikeloom.runtime.studies.robustness.proofs.bounds import lower_bound
-from spikeloom.runtime.studies.robustness.proofs.entries import cells_of
 
 EVENTS = np.ones((2, 3, 4), np.uint8)
 
@@ -59,16 +57,10 @@ def timed(**more):
     timing.detailed(tables, spikes, spikes, events, steps=np.array([sizes["steps"]]))
 
 
-def forgotten(late):
-    netlist = specimen("counters").machine.netlist
-    chip, known = known_run()
-    cells = cells_of(np.ones((netlist.taxels, netlist.polarities, 5), np.uint8), netlist)
-    effects = kernel.effects(chip, known, 3, single(cells.cells))
-    steps = len(known.fired)
-    back = np.full(steps + 1, steps + late)
-    votes = np.zeros((steps + 1, steps, 3), np.int16)
-    state = Forgetting(lag=1, quiet=np.full(steps + 1, steps), back=back, gone=votes, come=votes)
-    lower_bound(np.array([9, 1, 1]), cells, effects, state, 2)
+def grouped(*, steps=5, decision=0, reach=1):
+    machine = specimen("counters").machine
+    channels = np.ones((machine.netlist.n_inputs, 5), np.uint8)
+    machine.groups(channels, steps, decision, np.array([1]), reach)
 
 
 OUTSIDE = {
@@ -82,7 +74,9 @@ OUTSIDE = {
     "a compartment that is timed": lambda: timed(compartments=1),
     "a channel that is timed": lambda: timed(channels=1),
     "a chip step that is timed": lambda: timed(steps=1),
-    "a step at which the chip is at rest": lambda: forgotten(1),
+    "a step that events are changed in": lambda: grouped(steps=6),
+    "a class that is decided": lambda: grouped(decision=99),
+    "a spacing that is out of reach": lambda: grouped(reach=0),
 }
 
 
@@ -94,4 +88,4 @@ def test_an_index_outside_is_refused_before_machine_code_runs(call):
 def test_indices_inside_are_taken():
     flipped(0, 4)
     timed()
-    forgotten(0)
+    grouped()

@@ -287,6 +287,9 @@ def test_an_attack_alters_the_decision_with_the_events_that_it_names():
     netlist, given = small_netlist(0), events(8, samples=4, steps=60, rate=0.1)
     result = study_of(netlist, given)
     assert any(each.at_most is not None and each.at_most > 1 for each in result.certificates)
+    for each, quick in zip(result.certificates, study_of(netlist, given, most=1).certificates, strict=True):
+        assert (quick.kinds, quick.phases) == (each.kinds, each.phases)
+        assert quick.at_least == min(each.at_least, 1)
     for one, found in zip(given, result.certificates, strict=True):
         changed = one.copy()
         for words in found.attack:

@@ -258,8 +258,12 @@ class Loihi(Damageable, Explainable, Stoppable):
         """By interval arithmetic on registers."""
         if self._chip is None:
             return None
+        from spikeloom.compiler.layer_kernel import require_below
         from spikeloom.runtime.machines.loihi1.changes import boxes, kernel
 
+        require_below("steps", np.array([steps]), channels.shape[1] + 1)
+        require_below("class", np.array([decision]), self.netlist.classes)
+        require_below("spacing", apart, reach + 1)
         shape = self.netlist.taxels * self.netlist.polarities, steps, self.netlist.classes
         known = kernel.known_run(self._chip, channels)
         return boxes.groups(self._chip, known, shape, decision, apart, reach)

@@ -13,7 +13,7 @@ from spikeloom.runtime.studies.robustness.proofs.entries import Cells
 CANDIDATES = 2000
 """Entries that a further round looks at."""
 
-ROUNDS = 6
+ROUNDS = 16
 
 
 def attack(
@@ -22,7 +22,8 @@ def attack(
     """Entries whose flips together alter the decision of a recording (channels, steps); empty if none do.
 
     Those that cost the decision most votes against one class are taken, none while another still has an
-    effect; then, in the changed recording, further ones. Those that turn out not to be needed are dropped.
+    effect, until they do half of what is lacking; then, in the changed recording, further ones. Those that
+    turn out not to be needed are dropped.
     `votes` (classes,) are of the recording, `effects` of each entry alone.
     """
     decision, gaps = needed(votes)
@@ -58,7 +59,8 @@ def _against(
     taken = np.zeros(0, np.int64)
     those = np.arange(len(cells.cells))
     for _ in range(ROUNDS):
-        gap = needed(now)[1][other] if int(np.argmax(now)) == decision else 0
+        lacking = needed(now)[1][other] if int(np.argmax(now)) == decision else 0
+        gap = (lacking + 1) // 2
         worth = effects.votes[:, other] - effects.votes[:, decision]
         order = np.argsort(-worth / cells.cost[those], kind="stable")
         busy = np.zeros(int(effects.end.max(initial=0)) + 2, np.bool_)

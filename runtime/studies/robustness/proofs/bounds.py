@@ -38,6 +38,7 @@ def lower_bound(votes: IntArray, groups: Groups, apart: IntArray, most: int) -> 
         most_lost,
     )  # with numba, which help need not wait for
 
+    assert apart[0] == 1, "a group may follow another in the next step"
     decision, gaps = needed(votes)
     certified = most
     for other in np.argsort(gaps, kind="stable").tolist():

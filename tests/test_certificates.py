@@ -1,0 +1,131 @@
+"""The file of certificates, and the program of its own that checks it: on both chips, and with errors planted in it."""
+
+import ast
+import io
+import json
+import subprocess
+import sys
+import tokenize
+from pathlib import Path
+from runpy import run_path
+
+import numpy as np
+from commands import run
+from made_files import events, recordings_folder
+from test_stability import small_netlist
+from zoo import MAKERS, over, specimen
+
+from spikeloom.compiler.archive import archive_bytes, read_members
+from spikeloom.compiler.targets.loihi1.netlist import write_netlist
+from spikeloom.runtime.studies.robustness.proofs.entries import channels_of
+
+CHECKER = Path(__file__).parents[1] / "examples" / "check_certificate.py"
+ck = run_path(str(CHECKER))
+
+
+def certified(folder, netlist, data, *options):
+    code, _, err = run(
+        "certify", netlist, "--data", data, "--certificate", folder / "cert", "--shift", "0", *options
+    )
+    assert code == 0, err
+    return read_members(folder / "cert")
+
+
+def checked(folder, netlist, members):
+    """What the program says of a certificate of these members."""
+    manifest = json.loads(str(members["manifest"]))
+    arrays = {name: each for name, each in members.items() if name not in ("manifest", "sha256")}
+    (folder / "planted").write_bytes(archive_bytes(manifest, arrays))
+    words = [sys.executable, "-I", CHECKER, netlist, folder / "planted"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_the_checker_needs_numpy_alone_and_is_short():
+    text = CHECKER.read_text()
+    tree = ast.parse(text)
+    names = {
+        name.split(".")[0]
+        for node in ast.walk(tree)
+        for name in (
+            [each.name for each in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module]
+            if isinstance(node, ast.ImportFrom)
+            else []
+        )
+    }
+    assert names <= {*sys.stdlib_module_names, "numpy"}
+    quiet = {
+        tokenize.COMMENT,
+        tokenize.NL,
+        tokenize.NEWLINE,
+        tokenize.INDENT,
+        tokenize.DEDENT,
+        tokenize.ENDMARKER,
+    }
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    code = {
+        line for each in tokens if each.type not in quiet for line in range(each.start[0], each.end[0] + 1)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
+            code -= set(range(node.body[0].lineno, node.body[0].end_lineno + 1))
+    assert len(code) <= 300
+
+
+@over(MAKERS)
+def test_the_checker_runs_every_kind_of_network_as_the_engines_do(name):
+    made = specimen(name)
+    netlist = made.machine.netlist
+    about, arrays = ck["load"](made.netlist)
+    chip = {"loihi1": ck["Loihi"], "truenorth": ck["TrueNorth"]}[about["target"]](about, arrays)
+    channels = channels_of(made.events, netlist)
+    for one, votes in zip(channels, made.machine.votes(channels), strict=True):
+        counts = ck["run"](chip, one > 0, np.zeros(one.shape, np.bool_), 0)[1]
+        np.testing.assert_array_equal(counts.sum(axis=0), votes)
+
+
+def test_certificates_of_several_events_hold_and_planted_errors_do_not(tmp_path):
+    write_netlist(small_netlist(4), tmp_path / "net.loom")
+    write_netlist(small_netlist(1), tmp_path / "other.loom")
+    recordings_folder(tmp_path / "data", test=events(4, samples=2, steps=50, rate=0.1))
+    good = certified(tmp_path, tmp_path / "net.loom", tmp_path / "data")
+    assert set(good["rule"].tolist()) <= {2, 3}
+    assert good["unaltered"].max() >= 2
+    assert np.all(np.diff(good["change_bounds"]) > 0)
+    code, said = checked(tmp_path, tmp_path / "net.loom", good)
+    assert code == 0, said
+    assert f"no {good['unaltered'][1]} events alter that" in said
+
+    def planted(**changes):
+        code, said = checked(tmp_path, tmp_path / "net.loom", good | changes)
+        assert code == 1
+        return said
+
+    at_most = np.diff(good["change_bounds"])
+    assert "that no" in planted(unaltered=at_most)  # which these changes do alter
+    assert "rule 1 cannot" in planted(rule=np.ones_like(good["rule"]))
+    assert "rule 7 cannot" in planted(rule=np.full_like(good["rule"], 7))
+    assert "the decision" in planted(decision=1 - np.minimum(good["decision"], 1))
+    fewer = {"changes": good["changes"][1:], "change_bounds": np.maximum(good["change_bounds"] - 1, 0)}
+    assert "changes named" in planted(**fewer)
+    assert "does not have" in planted(changes=good["changes"] * 0 + good["bins"].shape[0])
+    code, said = checked(tmp_path, tmp_path / "other.loom", good)
+    assert code == 1
+    assert "another netlist" in said
+
+
+@over(["tactilesgnet", "counters", "native", "counters-crossbars"])
+def test_certificates_of_single_events_are_checked_on_both_chips(tmp_path, name):
+    made = specimen(name)
+    good = certified(tmp_path, made.netlist, made.data, "--most", "1")
+    code, said = checked(tmp_path, made.netlist, good)
+    assert code == 0, said
+    stable, fallen = good["unaltered"] > 0, np.diff(good["change_bounds"]) > 0
+    assert np.all(stable != fallen)
+    if fallen.any():
+        each = {"rule": np.ones_like(good["rule"]), "unaltered": np.ones_like(good["unaltered"])}
+        code, said = checked(tmp_path, made.netlist, good | each)
+        assert code == 1
+        assert "no single event" in said
