@@ -40,14 +40,11 @@ def groups(
     sources = places + 2 * len(known.events)
     lost = np.full((len(apart), 2, steps, reach, classes), -FAR, np.int32)
     blocks = np.zeros((2, len(chip.depth)), np.uint8)
-    base = _Base(*np.zeros((4, places), np.int32), *np.zeros((2, sources), np.int64), blocks[0])
-    work = _Work(
-        *np.zeros((6, places), np.int32),
-        *np.zeros((2, sources), np.int64),
-        np.zeros(places, np.uint8),
-        blocks[1],
-        np.zeros(classes, np.int64),
-    )
+    registers = np.zeros((10, places), np.int32)
+    lists = np.zeros((4, sources), np.int64)
+    codes = np.zeros(places, np.uint8)
+    base = _Base._make([*registers[:4], *lists[:2], blocks[0]])
+    work = _Work._make([*registers[4:], *lists[2:], codes, blocks[1], np.zeros(classes, np.int64)])
     lag = lag_of(chip, known)
     left = _left(chip, known, classes)
     _bound(chip, known, safe(chip, known), left, channels, decision, apart, lag, base, work, lost)
@@ -288,7 +285,7 @@ def _past(chip: Chip, known: Known, bounds: Safe, start: Any, t: Any, base: Any,
 @compiled
 def _count(chip: Chip, known: Known, t: Any, decision: Any, work: Any, n: Any) -> Any:
     """Votes that other classes gain, and that the decision loses, at worst, in a step."""
-    lost = 0
+    lost = np.int64(0)
     channels = len(known.events)
     for k in range(n):
         c = work.listed[k] - channels
