@@ -194,8 +194,8 @@ def fit_rules(data: Counted, classes: int, strengths: Iterable[float]) -> dict[f
     ordered = sorted(strengths)  # so that each starts at what the one before has found
     weights = _by_weights if len(spikes) > max(MOST_ALIKE, len(used)) else _by_shares
     rules = {}
-    for strength, found in zip(ordered, weights(spikes, sign, ordered), strict=True):
-        weight = found.reshape(-1, levels, len(used))
+    for strength, flat in zip(ordered, weights(spikes, sign, ordered), strict=True):
+        weight = flat.reshape(-1, levels, len(used))
         if levels > 1:
             weight[:, 0] *= THING
         rules[strength] = Rule(used=used, weight=weight.cumsum(axis=1).reshape(classes, -1))

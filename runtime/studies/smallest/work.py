@@ -193,14 +193,14 @@ def measure(work: Trial) -> JsonObject:
     if work.fold is not None:
         return _encoded(_network(work, training))
     rows = evenly_spaced(np.arange(len(training)), SEEN.get(work.rung, len(training)))
-    found = kinds[work.candidate.system](work, training.part(rows))
+    measured = kinds[work.candidate.system](work, training.part(rows))
     right, tried = np.zeros((2, len(training)), np.int64)
-    right[rows], tried[rows] = found.right, found.tried
-    return _encoded(replace(found, right=tuple(right.tolist()), tried=tuple(tried.tolist())))
+    right[rows], tried[rows] = measured.right, measured.tried
+    return _encoded(replace(measured, right=tuple(right.tolist()), tried=tuple(tried.tolist())))
 
 
-def _encoded(found: Measured) -> JsonObject:
-    values: JsonObject = encode(found)
+def _encoded(measured: Measured) -> JsonObject:
+    values: JsonObject = encode(measured)
     return values
 
 
