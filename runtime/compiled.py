@@ -243,6 +243,7 @@ class Compiled:
         scheduler: str | None = None,
         picture: str | None = None,
         output: str | None = None,
+        certificate: str | None = None,
     ) -> Certificates:
         """Decide for every small change of each recording whether it alters the decision; none is sampled.
 
