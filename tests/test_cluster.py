@@ -20,7 +20,7 @@ from spikeloom.runtime.requests.choices import ClusterChoice
 from spikeloom.runtime.studies import cluster
 from spikeloom.runtime.studies.jobs import sweep
 
-pytest.importorskip("distributed", reason="the extra spikeloom[cluster] is not installed")
+distributed = pytest.importorskip("distributed", reason="the extra spikeloom[cluster] is not installed")
 
 pytestmark = pytest.mark.filterwarnings("default")  # those of Dask are its own
 
@@ -35,6 +35,8 @@ class Dask:
         self.scheduler = self.start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
         self.workers = [self.worker(), self.worker()]
         self.address = json.loads(self.waited(folder / "scheduler.json").read_text())["address"]
+        with distributed.Client(self.address, set_as_default=False) as client:
+            client.wait_for_workers(len(self.workers), timeout=60)
 
     def start(self, what: str, *words: str) -> subprocess.Popen:
         path = os.pathsep.join([str(HERE.parent / "src"), str(HERE)])
@@ -126,10 +128,11 @@ def test_commands_give_the_same_bytes(dask, tmp_path, monkeypatch):
 
 def test_points_of_a_lost_worker_are_done_elsewhere(dask, tmp_path):
     log = tmp_path / "log"
-    made = points(log, 8, seconds=dict.fromkeys(range(8), 0.3))
+    made = points(log, 8, seconds={0: 2, 1: 2})  # so that both workers are at work then
 
     def kill():
-        dask.waited(log)
+        while len(begun(log)) < 2:
+            time.sleep(0.01)
         dask.workers[0].kill()
 
     threading.Thread(target=kill).start()
