@@ -254,6 +254,16 @@ def _unknown(chip: Chip, known: Known, start: Any, work: Any) -> Any:
 
 
 @compiled
+def _copy_state(source: Any, target: Any, n: Any) -> None:
+    copy(source.low_u, target.low_u)
+    copy(source.high_u, target.high_u)
+    copy(source.low_v, target.low_v)
+    copy(source.high_v, target.high_v)
+    copy(source.listed[:n], target.listed[:n])
+    copy(source.kind[:n], target.kind[:n])
+
+
+@compiled
 def _past(chip: Chip, known: Known, bounds: Safe, start: Any, t: Any, base: Any, work: Any) -> Any:
     """Bounds before step `t` where nothing is known of what was before `start`; spikes that are open then."""
     n = 0
@@ -271,12 +281,7 @@ def _past(chip: Chip, known: Known, bounds: Safe, start: Any, t: Any, base: Any,
             n = 0
             for block in range(len(chip.depth)):
                 n = _step(chip, known, work, s, block, n)
-        copy(work.low_u, base.low_u)
-        copy(work.high_u, base.high_u)
-        copy(work.low_v, base.low_v)
-        copy(work.high_v, base.high_v)
-        copy(work.listed[:n], base.listed[:n])
-        copy(work.kind[:n], base.kind[:n])
+        _copy_state(work, base, n)
     for block in range(len(chip.depth)):
         base.live[block] = unsafe(chip, known, bounds, _box(base), t, block)
     return n
@@ -379,16 +384,6 @@ def _follow(
     return over or t == steps
 
 
-@compiled
-def _restart(base: Any, work: Any, n: Any) -> None:
-    copy(base.low_u, work.low_u)
-    copy(base.high_u, work.high_u)
-    copy(base.low_v, work.low_v)
-    copy(base.high_v, work.high_v)
-    copy(base.listed[:n], work.listed[:n])
-    copy(base.kind[:n], work.kind[:n])
-
-
 @compiled_and_cached
 def _bound(
     chip: Chip,
@@ -406,7 +401,7 @@ def _bound(
     for t in range(lost.shape[2]):
         for level in range(len(apart)):
             n = _past(chip, known, bounds, t - apart[level] + 1, t, base, work)
-            _restart(base, work, n)
+            _copy_state(base, work, n)
             for source in range(channels):
                 work.listed[n + source] = source
                 work.kind[n + source] = -2 if known.events[source, t] else 2
@@ -418,7 +413,7 @@ def _bound(
             for source in range(channels):
                 clear(work.low)
                 clear(work.high)
-                _restart(base, work, n)
+                _copy_state(base, work, n)
                 work.listed[n] = source
                 work.kind[n] = -1 if known.events[source, t] else 1
                 _follow(chip, known, bounds, left, t, n + 1, decision, lag, base, work, lost[level, 0, t])
