@@ -1,7 +1,8 @@
 """Stored results: what made each, in how many seconds, and whether the code that it depends on has changed since.
 
     python -m benchmarks                                          # all of them
-    python -m benchmarks --again NAME [--write] [--files FOLDER]  # run what made a result again, and compare
+    python -m benchmarks --again NAME… [--write] [--files FOLDER] # run what made these results again, and compare
+    python -m benchmarks --again --under 60                       # all that were seen to take less than 60 s
 
 A result depends on the files of this repository that the processes of its command opened to read, pages left out;
 ``traced/sitecustomize.py`` notes them. ``--write`` stores the new result with its pictures, and in ``results/runs``
@@ -110,7 +111,7 @@ def run(name: str, place: Path, sources: list[Path]) -> dict[str, Any]:
     if program == "spikeloom":
         (results / name).write_text(done.stdout, "utf-8")
     if done.returncode not in (0, 1) or not (results / name).exists():
-        raise SystemExit(f"{name}: exit code {done.returncode}\n{done.stderr[-2000:]}")
+        raise RuntimeError(f"exit code {done.returncode}\n{done.stderr[-2000:]}")
     return {"seconds": round(seconds, 1), "files": depends(place / "log", place)}
 
 
@@ -152,19 +153,37 @@ def show(name: str) -> str:
     return f"{name}: {state(name)}, {took}, data {data}\n    {content.get('command', 'in README.md')}"
 
 
+def chosen(given: list[str], under: float | None) -> list[str]:
+    """Results to run again: those that were given, or all that are known to take less time."""
+    took = {name: read(RUNS / name).get("seconds", math.inf) for name in given or names()}
+    return sorted(
+        took if under is None else (name for name in took if took[name] < under), key=took.__getitem__
+    )
+
+
 def main() -> None:
-    """List the results, or run one again; exit code 1 if it differs."""
+    """List the results, or run some again; exit code 1 if one differs or does not come out."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=str(__doc__).splitlines()[0])
-    parser.add_argument("--again", choices=names(), metavar="NAME", help="for example shown/cost.json")
+    parser.add_argument(
+        "--again", nargs="*", choices=names(), metavar="NAME", help="for example shown/cost.json"
+    )
+    parser.add_argument("--under", type=float, metavar="SECONDS", help="only those that took less")
     parser.add_argument("--write", action="store_true", help="store what came out, and its record")
     parser.add_argument("--files", type=Path, metavar="FOLDER", help="with what else commands read")
     arguments = parser.parse_args()
-    if not arguments.again:
+    if arguments.again is None:
         print("\n".join(map(show, names())))
         return
-    found = again(arguments.again, arguments.write, arguments.files)
-    print("\n".join([f"{arguments.again}: {len(found)} differences", *found[:20]]))
-    sys.exit(bool(found))
+    bad = 0
+    for name in chosen(arguments.again, arguments.under):
+        try:
+            found = again(name, arguments.write, arguments.files)
+            print("\n".join([f"{name}: {len(found)} differences", *found[:20]]), flush=True)
+        except RuntimeError as error:
+            found = [str(error)]
+            print(f"{name}: {error}", flush=True)
+        bad += bool(found)
+    sys.exit(bad > 0)
 
 
 if __name__ == "__main__":
