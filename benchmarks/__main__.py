@@ -7,7 +7,8 @@
 A result depends on the files of this repository that the processes of its command opened to read, pages left out;
 ``traced/sitecustomize.py`` notes them. ``--write`` stores the new result with its pictures, and in ``results/runs``
 the seconds that it took and a digest of each of these files: of Python its statements without comments and docstrings,
-of others the bytes. A result without such a record is ``not known`` to be up to date. Commands run in a copy of this
+of others the bytes. A result without such a record is ``not known`` to be up to date; ``finished`` is one whose script
+is only in the history. Commands run in a copy of this
 folder, beside links to ``$SPIKELOOM_SHARED/data``, ``checkpoints``, and what else they read, in FOLDER.
 """
 
@@ -71,7 +72,10 @@ def digest(name: str) -> str:
 
 
 def state(name: str) -> str:
-    """Whether the files that a result depends on are as they were."""
+    """Whether the files that a result depends on are as they were; a study is finished if its script is gone."""
+    script = re.match(r"python (benchmarks/\S+)", read(RESULTS / name).get("command", ""))
+    if script and not (ROOT / script[1]).exists():
+        return "finished"
     files = read(RUNS / name).get("files", {})
     changed = [file for file, noted in files.items() if digest(file) != noted]
     return f"stale ({', '.join(changed[:3])})" if changed else "up to date" if files else "not known"
