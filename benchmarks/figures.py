@@ -16,6 +16,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -370,11 +371,33 @@ def shown(session: Session, page: str) -> Json:
     return found
 
 
+def taken_for(session: Session, network: str, data: str) -> list[tuple[int, int]]:
+    """Class of each test recording, and what the chip takes it for."""
+    session.run(f"compile {network} --calibrate {data} --weight-bits 8 -o net.loom")
+    found = session.run(f"run net.loom --data {data}")
+    return list(zip(found["labels"], found["predictions"], strict=True))
+
+
+def confused_objects(session: Session) -> Json:
+    """Which objects two networks take for others, those with most wrong decisions first."""
+    found = {}
+    for name, network in {
+        "TactileSGNet": f"{MANUAL} --graph manual",
+        "counters": "pretrained:objects-counters",
+    }.items():
+        wrong = Counter(label for label, decided in taken_for(session, network, OBJECTS) if label != decided)
+        found[name] = {
+            "wrong": wrong.total(),
+            "classes": len(wrong),
+            "worst": [label for label, times in wrong.most_common() if times > 1],
+            "of_them": sum(times for times in wrong.values() if times > 1),
+        }
+    return found
+
+
 def confusion(session: Session) -> Json:
     """What the chip takes for what on Containers: another container, or another filling of the same."""
-    session.run(f"compile pretrained:containers --calibrate {CONTAINERS} --weight-bits 8 -o net.loom")
-    found = session.run(f"run net.loom --data {CONTAINERS}")
-    pairs = list(zip(found["labels"], found["predictions"], strict=True))
+    pairs = taken_for(session, "pretrained:containers", CONTAINERS)
     other = sum(label // FILLINGS != decided // FILLINGS for label, decided in pairs)
     wrong = sum(label != decided for label, decided in pairs)
     near = sum(
@@ -441,6 +464,7 @@ STUDIES: dict[str, Callable[[Session], Json]] = {
     "rtl-native": lambda session: hardware(session, "native"),
     "neurobench": neurobench,
     "confusion-containers": confusion,
+    "confusion-objects": confused_objects,
     "longer-bins": longer_bins,
     "pretrained": pretrained,
     "shipped": shipped,
