@@ -62,7 +62,10 @@ EDITS = {
     "more perturbations": {"docs/stress.md": ("A seeded battery of 26", "A seeded battery of 30")},
     "most of the wrong": {"docs/questions.md": ("On Objects 12 of the 18", "On Objects 17 of the 18")},
     "a unit in a header": {
-        "docs/precision.md": ("| Objects | right | equal | spikes |", "| Objects | right | equal | thousands |")
+        "docs/precision.md": (
+            "| Objects | right | equal | spikes |",
+            "| Objects | right | equal | thousands |",
+        )
     },
     "swapped headers, verify": {VERIFY: ("| checkpoint | float | chip |", "| checkpoint | chip | float |")},
     "swapped headers, stability": {
