@@ -231,9 +231,16 @@ def test_whole_steps_and_one_at_least():
 
 
 def test_every_recording_keeps_its_part_of_its_own_length():
-    found = first_part(made(np.array([10, 5, 1])), 50)
+    whole = made(np.array([10, 5, 1]))
+    assert whole.events[1, ..., 2:5].any()
+    found = first_part(whole, 50)
     assert found.lengths.tolist() == [5, 2, 1]
     assert found.steps == 5
+    for index, steps in enumerate(
+        (5, 2, 1)
+    ):  # what is behind a part is silence: bins that are joined may reach there
+        assert_array_equal(found.events[index, ..., :steps], whole.events[index, ..., :steps])
+        assert not found.events[index, ..., steps:].any()
 
 
 @pytest.mark.parametrize(("words", "percent"), [("1%", 1), ("50", 50), (" 100% ", 100)])

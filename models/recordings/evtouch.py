@@ -351,8 +351,9 @@ def first_part(recordings: Recordings, percent: int) -> Recordings:
     lengths = recordings.step_counts
     kept = steps_of(lengths, percent)
     longest = int(kept.max(initial=0))
-    return replace(
-        recordings,
-        events=recordings.events[..., :longest],
-        lengths=None if recordings.lengths is None else kept,
-    )
+    events = recordings.events[..., :longest]
+    if recordings.lengths is None:
+        return replace(recordings, events=events)
+    # what is joined to a later step, or run on, must not bring back what was cut off
+    inside = np.arange(longest) < kept[:, None, None, None]
+    return replace(recordings, events=events * inside, lengths=kept)

@@ -222,7 +222,7 @@ def load_recordings(
 
 def in_steps(data: Recordings, netlist: Netlist, window: int = WHOLE) -> Recordings:
     """Recordings in steps of a network: the first `window` per cent of each, as long as the network needs."""
-    data = first_part(events.joined_bins(data, netlist.bins), window)
+    data = events.joined_bins(first_part(data, window), netlist.bins)
     length = netlist.clocks.length
     steps = origin_of(netlist.provenance).get("steps", length)
     if length is not None and (late := int(data.events[..., steps:].sum(dtype=np.int64))):

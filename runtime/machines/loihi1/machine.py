@@ -21,7 +21,9 @@ from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
+from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
+from spikeloom.models.recordings.evtouch import WHOLE
 from spikeloom.runtime.machines.base import Done, Model, Price, Run, T, differences, one_by_one
 from spikeloom.runtime.machines.capabilities import Cumulative, Damageable, Explainable, Memory, Stoppable
 from spikeloom.runtime.machines.changes import Changes, Effects, Groups
@@ -31,6 +33,7 @@ from spikeloom.runtime.machines.loihi1.stream import Stream
 from spikeloom.runtime.machines.loihi1.trace import Trace, aligned, unpack
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.votes import class_counts
+from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.sections import Block, Outcome
 
 if TYPE_CHECKING:
@@ -320,6 +323,11 @@ class Loihi(Damageable, Explainable, Stoppable):
 
     def stream(self) -> Stream:
         """One grasp, bin after bin."""
+        if (window := origin_of(self.netlist.provenance).get("window", WHOLE)) < WHOLE:
+            tell(
+                f"warning: {self.file}: was trained on the first {window} % of each recording; a stream does not know "
+                "where these end, so end each grasp there"
+            )
         return Stream(self._stepwise)
 
 

@@ -154,17 +154,10 @@ def _read(data: Data, network: NetworkFile, groups: Groups) -> dict[str, Recordi
     return read_splits(data.path, data.bin_s, network, groups.words)
 
 
-@lru_cache(maxsize=2)
-def _in_steps(data: Data, network: NetworkFile, groups: Groups) -> dict[str, Recordings]:
-    """The same in the steps of a network that joins bins."""
-    return {split: joined_bins(each, network.bins) for split, each in _read(data, network, groups).items()}
-
-
 def _calibration(work: Measurement) -> Recordings:
     """The part of the training recordings that ``compile`` calibrates on, in steps of the network."""
     network = work.network
-    training = first_part(_read(work.data, network, work.groups)["train"], network.window)
-    return of_length(joined_bins(training, network.bins), network.length)
+    return _part(network, _read(work.data, network, work.groups)["train"], network.window)
 
 
 @lru_cache(maxsize=2)
@@ -181,7 +174,7 @@ def _decided(
 ) -> dict[int, dict[str, IntArray]]:
     """Decisions of the float32 model by window and split."""
     loaded = _loaded(network)
-    splits = _in_steps(data, network, groups)
+    splits = _read(data, network, groups)
 
     def decisions(part: Recordings) -> IntArray:
         return vote(votes_so_far(loaded.network, part)[:, -1])
@@ -193,8 +186,8 @@ def _decided(
 
 
 def _part(network: NetworkFile, data: Recordings, window: int) -> Recordings:
-    """As long a part of each recording as a window says, run as long as the network says."""
-    return of_length(first_part(data, window), network.length)
+    """As long a part of each recording as a window says, in steps of the network, run as long as it says."""
+    return of_length(joined_bins(first_part(data, window), network.bins), network.length)
 
 
 def measure(work: Measurement) -> JsonObject:
@@ -229,7 +222,7 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
     file.parent.mkdir(parents=True, exist_ok=True)
     sha256 = write_netlist(netlist, file)
     machine = machine_of(netlist)
-    splits = _in_steps(work.data, work.network, work.groups)
+    splits = _read(work.data, work.network, work.groups)
     figures = {
         window: {
             split: _figures(machine, _part(work.network, splits[split], window), work.data.bin_s, decisions)
