@@ -42,7 +42,7 @@ def cells():
     """The product; those that take long on all ways in are slow."""
     for name in WAYS_IN:
         for out, way in WAYS_OUT.items():
-            slow = way.slow or (way.long and name not in ways.IN_SHORT)
+            slow = way.slow or name in ways.WIDE or (way.long and name not in ways.IN_SHORT)
             yield pytest.param(name, out, marks=[pytest.mark.slow] if slow else [], id=f"{name} | {out}")
 
 
@@ -73,8 +73,9 @@ def about(due):
 def test_something_is_tested(name):
     due = truth(case(name))
     assert all(due["spikes"]), "a layer is silent"
-    assert len({tuple(votes) for votes in due["votes"]}) > 1
-    assert due["operations"][1] > 0
+    assert any(map(any, due["votes"]))
+    _, least, most = due["operations"]
+    assert 0 < least < most
 
 
 def test_every_command_format_and_function_is_a_way_out_or_says_why_not():

@@ -161,7 +161,7 @@ class WayOut:
     door: str  # ``typed``, ``Python``, or ``cluster``
     ask: Callable[[Case], Answer]
     slow: bool = False  # Whether it takes seconds
-    long: bool = False  # Whether it takes a second; some ways in are enough by default
+    long: bool = False  # Whether it takes long enough that some ways in are enough by default
 
 
 WAYS_OUT: dict[str, WayOut] = {}
@@ -246,6 +246,9 @@ NEUTRAL: dict[str, float | str] = {
 }
 """Of each perturbation the level at which it does nothing, or why it has none."""
 
+LONG = ("report", "stress", "certify")
+"""Those of the next that take a tenth of a second."""
+
 BY_BOTH_DOORS: dict[str, tuple[str, Callable[[Any, Case], Answer]]] = {
     "run": ("", _run),
     "verify": ("--spec-samples 1", _verify),
@@ -282,8 +285,9 @@ def _in_python(command: str, made: Case, options: str) -> Any:
 
 
 def _by_both_doors(command: str, options: str, read: Callable[[Any, Case], Answer]) -> None:
-    way_out(command, command)(lambda made: read(_typed(command, made, options), made))
-    way_out(f"Python {command}", command, "Python")(
+    long = command in LONG
+    way_out(command, command, long=long)(lambda made: read(_typed(command, made, options), made))
+    way_out(f"Python {command}", command, "Python", long=long)(
         lambda made: read(_in_python(command, made, options), made)
     )
 
@@ -303,7 +307,7 @@ def _by_cycle(made: Case) -> Answer:
     return _estimate(_typed("estimate", made, "--detail cycle"), made)
 
 
-@way_out("verify beside onnxruntime", "verify")
+@way_out("verify beside onnxruntime", "verify", long=True)
 def _beside_onnx(made: Case) -> Answer:
     return _verify(_typed("verify", made, "--engine onnx --spec-samples 1"), made)
 
@@ -406,20 +410,18 @@ def _exported(made: Case, form: str, ending: str, *options: object) -> Path:
     return path
 
 
-@way_out("export nir, compile, run, estimate", "export nir")
+@way_out("export nir, compile, run, estimate", "export nir", long=True)
 def _by_nir(made: Case) -> Answer:
-    """The file brings its integers; where they lie hangs on options, and on the rates of training recordings."""
-    back = made.folder / "back.loom"
-    words = made.made.compiling.split()
-    layout = [
-        word for option, word in zip(["", *words], words, strict=False) if "--cores-for" in (option, word)
-    ]
-    layout += ["--free-running"] if "--free-running" in words else []
-    seen = ["--calibrate", made.data] if made.made.rounded else []
-    made.typed("compile", _exported(made, "nir", "nir"), *layout, *seen, "-o", back)
+    """The file brings its integers, but not where they lie, so that energies are those of the new netlist."""
+    back = str(made.folder / "back.loom")
+    layout = ["--free-running"] if "--free-running" in made.made.compiling else []
+    made.typed("compile", _exported(made, "nir", "nir"), *layout, "-o", back)
     (found,) = made.typed("run", back, "--data", made.data)
     (costs,) = made.typed("estimate", back, "--data", made.data)
-    return _run(found, made) | _estimate(costs, made)
+    there = truth(made)
+    answer = _run(found, made) | _estimate(costs, made) | {"netlist": back}
+    assert [answer["votes"], answer["operations"]] == [there["votes"], there["operations"]]
+    return answer
 
 
 @way_out("export onnx, onnxruntime", "export onnx")
@@ -439,8 +441,11 @@ def _by_onnx(made: Case) -> Answer:
 OF_SOME = ("certify", "Python certify", "certify on a cluster")
 """Ways out that are asked about the first recordings only."""
 
-IN_SHORT = ("released", "window", "counters", "counters-crossbars", "native", "netx", "module", "onnx")
-"""Ways in on which those that take long are asked by default."""
+IN_SHORT = ("released", "window", "module", "recurrent", "counters", "counters-crossbars", "native", "netx")
+"""Ways in on which ways out that are long are asked by default."""
+
+WIDE = ("mlp", "gcn", "grid-cnn", "binned", "joined", "joined-timed", "joined-tuned", "fine-tuned")
+"""Ways in on 39 taxels that are asked nothing by default."""
 
 
 # -- what cannot be ----------------------------------------------------------------------------------------------------
@@ -487,7 +492,7 @@ NO_ANSWER = {
     "doctor": "is about the installation",
     "compile": "makes every netlist here",
     "inspect": "is about a netlist, not recordings; its numbers are those of the file",
-    "smallest": "answers for networks that it trains by the functions of chart and run, see test_smallest",
+    "smallest": "trains its own networks; test_smallest repeats what it chose by its commands",
     "train": "a way in: trained counters",
     "finetune": "a way in: fine-tuned by command",
     "join": "a way in: joined by command",
