@@ -414,7 +414,10 @@ def _exported(made: Case, form: str, ending: str, *options: object) -> Path:
 def _by_nir(made: Case) -> Answer:
     """The file brings its integers, but not where they lie, so that energies are those of the new netlist."""
     back = str(made.folder / "back.loom")
-    layout = ["--free-running"] if "--free-running" in made.made.compiling else []
+    words = made.made.compiling.split()
+    layout = (
+        words if {"--free-running", "--cores-for"} & set(words) else []
+    )  # which changes what lists store
     made.typed("compile", _exported(made, "nir", "nir"), *layout, "-o", back)
     (found,) = made.typed("run", back, "--data", made.data)
     (costs,) = made.typed("estimate", back, "--data", made.data)
