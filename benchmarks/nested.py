@@ -1,6 +1,6 @@
 """Counting networks, a TactileSGNet and support vector machines in nested cross-validation over all recordings.
 
-    python benchmarks/nested.py DATA OUT.json [--levels 5] [--ramp 32] [--again 1] [--jobs 2]     (needs scikit-learn)
+    python benchmarks/nested.py DATA OUT.json [--levels 5] [--left-out speed=3600] [--jobs 2]     (needs scikit-learn)
 
 Both splits are put together and parted five times five ways. In each training part every plan and strength, kernel and
 constant is tried by cross-validation in five folds, plans within two standard errors of the best `--again` times;
@@ -12,7 +12,8 @@ parts was seen; it is trained from another seed in each round, and decides on th
 differences are bootstrapped over recordings. A system decides *as well as* another one if the interval of what the
 other has ahead of it ends below `MARGIN`, which was set before, too. Parts that were measured before are not again.
 
-Another sensor, as `write_events` and `write_taxels` of `unseen.py` make it: `--taxels taxels.csv --graph knn:4`.
+`--left-out speed=3600`: DATA are the textures of `unseen.py`, and recordings of that condition stand for the released
+test split.
 """
 
 from __future__ import annotations
@@ -24,12 +25,14 @@ from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
 from made import made as made_by
 from sklearn.svm import SVC
+from unseen import write_events, write_taxels
 
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.systems import TACTILESGNET
@@ -303,13 +306,18 @@ def main() -> None:
     )
     parser.add_argument("--again", type=int, default=1, help="cross-validations of plans near the best one")
     parser.add_argument("--ramp", type=int, default=32, help="steps of the read-out; twice for levels")
-    parser.add_argument("--taxels", help="positions of another sensor's taxels")
-    parser.add_argument("--graph", default="manual", help="of the taxels")
+    parser.add_argument("--left-out", metavar="CONDITION", help="of textures, for the test split")
     parser.add_argument("--jobs", type=int, default=1, help="networks that are trained at a time")
     arguments = parser.parse_args()
-    graph = load_graph(SensorChoice(graph=arguments.graph, taxels=arguments.taxels))
-    assert graph is not None, "one is named"
-    data, training = whole(arguments.recordings, len(graph.coordinates))
+    with TemporaryDirectory() as folder:
+        files, sensor = arguments.recordings, SensorChoice(graph="manual")
+        if arguments.left_out:
+            write_events(Path(files), Path(folder), arguments.left_out)
+            files, taxels = folder, write_taxels(Path(folder) / "taxels.csv")
+            sensor = SensorChoice(graph="knn:4", taxels=str(taxels))
+        graph = load_graph(sensor)
+        assert graph is not None, "one is named"
+        data, training = whole(files, len(graph.coordinates))
     plans = [
         Plan(
             bins=bins,
