@@ -307,7 +307,7 @@ def main() -> None:
     parser.add_argument("--again", type=int, default=1, help="cross-validations of plans near the best one")
     parser.add_argument("--ramp", type=int, default=32, help="steps of the read-out; twice for levels")
     parser.add_argument("--left-out", metavar="CONDITION", help="of textures, for the test split")
-    parser.add_argument("--jobs", type=int, default=1, help="networks that are trained at a time")
+    parser.add_argument("--jobs", type=int, default=1, help="networks and parts at a time")
     arguments = parser.parse_args()
     with TemporaryDirectory() as folder:
         files, sensor = arguments.recordings, SensorChoice(graph="manual")
@@ -341,7 +341,8 @@ def main() -> None:
     done = measured_parts(
         split,
         arguments.output.with_suffix(".parts.json"),
-        lambda rows, held: measured(data, all_counted, rows, held, arguments.again),
+        partial(measured, data, all_counted, again=arguments.again),
+        arguments.jobs,
     )
     for name, each in networks.items():
         done[name]["systems"][NETWORK.system] = each
