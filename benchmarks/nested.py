@@ -34,6 +34,7 @@ from made import made as made_by
 from sklearn.svm import SVC
 from unseen import write_events, write_taxels
 
+from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.systems import TACTILESGNET
 from spikeloom.compiler.targets.base import load_target
@@ -330,7 +331,12 @@ def main() -> None:
         for levels in sorted({1, arguments.levels})
         for bins, parts, events in SMALL + LARGE
     ]
-    all_counted = {name_of(plan): run_counters(data, plan) for plan in plans}
+    all_counted, too_fine = {}, []
+    for plan in plans:
+        try:
+            all_counted[name_of(plan)] = run_counters(data, plan)
+        except OptionError as error:  # More parts than the shortest recording has
+            too_fine.append(f"{name_of(plan)}: {error}")
     split = parted(data, training)
     networks: Json = {}
     for seed in range(ROUNDS):
@@ -347,7 +353,7 @@ def main() -> None:
     for name, each in networks.items():
         done[name]["systems"][NETWORK.system] = each
     nested = [name for name in split if name != "split"]
-    found: Json = {"rounds": ROUNDS, "folds": FOLDS}
+    found: Json = {"rounds": ROUNDS, "folds": FOLDS, "not_tried": too_fine}
     found["nested"] = summary([done[name] for name in nested], [split[name] for name in nested], len(data))
     own = done["split"]
     found["split"] = {
