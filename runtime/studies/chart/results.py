@@ -10,7 +10,7 @@ from spikeloom.runtime.studies.chart.grid import FEWEST, Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
 from spikeloom.runtime.studies.search.results import ChosenBy, Costs, Data, Share
 
-FORMAT = 4
+FORMAT = 5
 """Of what is measured; goes up when a figure means something else."""
 
 SPLITS = ("train", "test")
