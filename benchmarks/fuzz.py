@@ -1,4 +1,7 @@
-"""Damaged files for every reader of ``tests/readers.py``: how many are read, or refused in one line, or neither."""
+"""Damaged files for every reader of ``tests/readers.py`` and for commands: how many are read, or refused in one line.
+
+An output that is there already goes on where it ended, if the same command wrote it.
+"""
 
 import argparse
 import json
@@ -18,7 +21,7 @@ import readers
 
 KEYS = "tried", "read", "refused", "did_not"
 
-ROUNDS = 20
+ROUNDS = 40
 """After each of which the output is written."""
 
 
@@ -47,14 +50,19 @@ if __name__ == "__main__":
     parser.add_argument("--jobs", type=int, default=1)
     arguments = parser.parse_args()
     output, facts, names = arguments.output.absolute(), made(), list(readers.READERS)
-    table = {name: dict.fromkeys(KEYS, 0) for name in names}
     whole = sum(each.share for each in readers.READERS.values())
     each = [int(arguments.inputs * reader.share / whole / ROUNDS) + 1 for reader in readers.READERS.values()]
+    found = json.loads(output.read_text()) if output.exists() else {}
+    if any(found.get(key) != value for key, value in facts.items()):
+        found = facts | {"first": {}, "readers": {name: dict.fromkeys(KEYS, 0) for name in names}}
+    done = found["readers"][names[0]]["tried"] // each[0]
     with ProcessPoolExecutor(arguments.jobs, initializer=in_a_folder) as pool:
-        for turn in tqdm(range(ROUNDS), disable=None):
+        for turn in tqdm(range(done, ROUNDS), initial=done, total=ROUNDS, disable=None):
             seeds = [range(turn * count, (turn + 1) * count) for count in each]
             for name, row in zip(names, pool.map(run, names, seeds), strict=True):
-                table[name] = {key: table[name][key] + row[key] for key in KEYS}
-                facts.setdefault("first", {}).update(row["first"])
-            sums = {key: sum(row[key] for row in table.values()) for key in KEYS}
-            output.write_text(json.dumps(facts | sums | {"readers": table}, indent=1) + "\n")
+                found["readers"][name] = {key: found["readers"][name][key] + row[key] for key in KEYS}
+                found["first"].update(row["first"])
+            sums = {key: sum(row[key] for row in found["readers"].values()) for key in KEYS}
+            table = found.pop("readers")
+            found |= sums | {"readers": table}
+            output.write_text(json.dumps(found, indent=1) + "\n")

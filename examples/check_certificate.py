@@ -39,7 +39,12 @@ HORIZON = 32  # steps for which bounds are followed; of the rest all votes may t
 def require(holds, what):
     """Refuse what does not hold."""
     if not holds:
-        raise SystemExit(f"refused: {what}")
+        raise SystemExit(f"refused: {plain(what)}")
+
+
+def plain(text):
+    """What a file says, as a terminal may show it."""
+    return "".join(each if each.isprintable() else "?" for each in str(text)[:200])
 
 
 def load(path):
@@ -367,6 +372,14 @@ def check(chip, events, bins, claim):
 
 
 def main(netlist, certificate):
+    """Check all claims; the first that does not hold ends it, as does a file that is damaged."""
+    try:
+        check_all(netlist, certificate)
+    except Exception as error:  # numpy, json and zipfile raise whatever they meet
+        require(False, f"a damaged file ({type(error).__name__}: {error})")
+
+
+def check_all(netlist, certificate):
     """Check all claims; the first that does not hold ends it."""
     about, arrays = load(certificate)
     require(about.get("format") == "spikeloom-certificate" and about.get("version") == 1, "the format")
@@ -387,7 +400,7 @@ def main(netlist, certificate):
         claim = [int(arrays[name][n]) for name in ("decision", "unaltered", "rule")]
         cost = check(chip, events, bins, (*claim, arrays["changes"][ends[n] : ends[n + 1]]))
         altered = f"; {cost} alter it" if cost else ""
-        print(f"{file}: decides {claim[0]}; no {claim[1]} events alter that{altered}", flush=True)
+        print(f"{plain(file)}: decides {claim[0]}; no {claim[1]} events alter that{altered}", flush=True)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,9 @@ import io
 import json
 import os
 import random
+import re
 import sqlite3
+import tomllib
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -24,6 +26,7 @@ import made_files
 import made_netx
 import numpy as np
 import torch
+import typed
 from google.protobuf import json_format
 from made_chart import made_figures
 from made_files import torch_bytes
@@ -312,6 +315,26 @@ def lines_of(parts: list[Any]) -> bytes:
     ).encode()
 
 
+def toml(content: bytes) -> dict[str, Any]:
+    return tomllib.loads(content.decode())
+
+
+def given(
+    suffix: str,
+    good: Callable[[], Sequence[bytes]],
+    lines: str,
+    beside: str,
+    apart: Callable[[bytes], Any],
+    together: Callable[[Any], bytes],
+    words: tuple[str, ...] = (),
+    *,
+    share: float = 0.1,
+    place: str | None = None,
+) -> Reader:
+    """Commands that are given a file beside those of a network of the zoo."""
+    return Reader(suffix, good, typed.through(lines, beside, place), apart, together, words, share=share)
+
+
 # -- readers -----------------------------------------------------------------------------------------------------------
 def runs(path: Path) -> Any:
     """Read a netlist, measure its limits, run it and read it back as a network."""
@@ -432,6 +455,44 @@ READERS = {
     "store of a chart": Reader(
         ".sqlite", lambda: [store(KEPT)], kept, rows_of, store, sealed=True, share=0.25
     ),
+    # what commands make of it: signed again after each change
+    "run: netlist": given(".loom", of_zoo("mlp", "netlist"), "netlist", "mlp", parts_of_archive, archive_of),
+    "run: netlist of crossbars": given(
+        ".loom", of_zoo("native", "netlist"), "netlist of crossbars", "native", parts_of_archive, archive_of
+    ),
+    "run: own checkpoint": given(
+        ".pt", of_zoo("mlp"), "checkpoint", "mlp", parts_of_checkpoint, checkpoint_of
+    ),
+    "run: released checkpoint": given(
+        ".pt", partial(torch_files, True), "released checkpoint", "mlp", unpickled, torch_bytes
+    ),
+    "run: counting network": given(
+        ".pt", of_zoo("counters"), "counting network", "counters", parts_of_archive, archive_of
+    ),
+    "run: network for crossbars": given(
+        ".pt", of_zoo("native"), "network for crossbars", "native", parts_of_archive, archive_of
+    ),
+    "run: ONNX": given(".onnx", of_zoo("onnx"), "ONNX", "onnx", message, message_of, OPERATORS),
+    "run: NIR": given(
+        ".nir", of_zoo("recurrent"), "NIR", "recurrent", tree_of, hdf5_of, NIR_WORDS, share=0.04
+    ),
+    "run: netx": given(".net", of_zoo("netx"), "netx", "netx", tree_of, hdf5_of, NETX_WORDS, share=0.04),
+    "run: recordings": given(".zip", typed.recordings, "recordings", "mlp", parts_of_zip, zip_of),
+    "run: events": given(".npz", typed.events, "recordings", "mlp", parts_of_zip, zip_of),
+    "run: recordings of both splits": given(
+        ".zip", typed.recordings, "recordings of both splits", "mlp", parts_of_zip, zip_of
+    ),
+    "run: options": given(".toml", typed.options, "options", "mlp", toml, typed.toml_of, share=0.04),
+    "run: certificate": Reader(
+        "", typed.certificate, typed.checked, parts_of_archive, archive_of, share=0.1
+    ),
+    "run: stress": given(".json", typed.stress, "stress", "mlp", json.loads, json_of, share=0.02),
+    "run: store of smallest": given(
+        ".sqlite", typed.smallest, "store of smallest", "mlp", rows_of, store, share=0.005
+    ),
+    "run: store of a chart": given(
+        ".sqlite", typed.chart, "store of a chart", "mlp", rows_of, store, share=0.01, place="points.sqlite"
+    ),
 }
 
 
@@ -477,9 +538,13 @@ def changed_bytes(content: bytes, rng: random.Random) -> bytes:
     for _ in range(rng.choice((1, 1, 2, 5))):
         place = rng.randrange(len(data)) if data else 0
         length = rng.choice((1, 1, 2, 8, 100))
-        match rng.randrange(9):
+        match rng.randrange(10):
             case 0:
                 del data[place:]
+            case 9 if sizes := list(re.finditer(rb"[0-9]+", data[:20_000])):
+                declared = rng.choice(sizes)
+                huge = str(rng.choice(NUMBERS[6:])).encode()
+                data[slice(*declared.span())] = huge
             case 1:
                 del data[place : place + length]
             case 2:
@@ -526,7 +591,28 @@ def strange(old: Any, rng: random.Random, words: Sequence[str]) -> Any:
         )
     if isinstance(old, int | float) and rng.random() < 0.7:
         return rng.choice(NUMBERS if isinstance(old, int) else REALS)
-    return rng.choice([None, True, "", "a\nb\x1b[31m", [], {}, [[1, "b"]], {"a": 1}, *NUMBERS, *REALS])
+    odd = [
+        None,
+        True,
+        "",
+        "a\nb\x1b[31m",
+        "x" * 5000,
+        [],
+        {},
+        [[1, "b"]],
+        {"a": 1},
+        [0] * 100_000,
+        nested(200),
+    ]
+    return rng.choice([*odd, *NUMBERS, *REALS])
+
+
+def nested(depth: int) -> list[Any]:
+    """A list in a list, and so on."""
+    inner: list[Any] = []
+    for _ in range(depth):
+        inner = [inner]
+    return inner
 
 
 def changed_values(value: Any, rng: random.Random, words: Sequence[str]) -> Any:
@@ -551,6 +637,21 @@ def changed_values(value: Any, rng: random.Random, words: Sequence[str]) -> Any:
     return value
 
 
+def changed_member(content: bytes, rng: random.Random) -> bytes:
+    """One member of a zip changed, and the sums of the zip made right again; or one that declares another size."""
+    with zipfile.ZipFile(io.BytesIO(content)) as file:
+        members: dict[str, bytes | str] = {name: file.read(name) for name in file.namelist()}
+        central = file.start_dir
+    if rng.random() < 0.2:
+        data = bytearray(content)
+        data[central + 20 : central + 28] = (
+            rng.choice((0, 2**20, 2**31, 2**32 - 2)).to_bytes(4, "little") * 2
+        )
+        return bytes(data)
+    name = rng.choice(list(members))
+    return archive.zip_bytes(members | {name: changed_bytes(bytes(members[name]), rng)})
+
+
 def damaged(name: str, seed: int) -> tuple[bytes, int | None]:
     """A damaged file for a seed; and if only bytes are, of which good one."""
     rng, reader = random.Random(f"{name} {seed}"), READERS[name]
@@ -561,6 +662,8 @@ def damaged(name: str, seed: int) -> tuple[bytes, int | None]:
             content = reader.together(changed_values(apart(name, index), rng, reader.words))
         except Exception:  # values that the format cannot hold at all
             only_bytes = True
+    if only_bytes and content[:2] == b"PK" and rng.random() < 0.5:
+        return changed_member(content, rng), None
     if only_bytes or rng.random() < 0.1:
         content = rng.randbytes(rng.randrange(300)) if rng.random() < 0.02 else changed_bytes(content, rng)
     return content, index if only_bytes else None
