@@ -40,7 +40,7 @@ COMMON: dict[str, archive.Kind] = {
 """Entries of every manifest."""
 
 
-ORIGIN = ("data", "bin_s", "window", "steps")
+ORIGIN = ("data", "train_sha256", "bin_s", "window", "steps")
 """What a netlist remembers of the recordings behind a network, beside names and places."""
 
 
@@ -53,7 +53,7 @@ def names_of(training: Mapping[str, Any] | None, classes: int) -> list[str] | No
 def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
     """What a netlist remembers of the recordings behind a network.
 
-    Their name, their bins if they were events, per cent of each or steps that trained it if not all did, where
+    Their name and hash, their bins if they were events, per cent of each or steps that trained it if not all did, where
     the taxels were and how classes are called, if that was said; no value that a netlist may not have.
     """
     said = training or {}
@@ -72,7 +72,7 @@ def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
 
 PROVENANCE: dict[str, archive.Kind] = {
     **dict.fromkeys(
-        ("spikeloom", "checkpoint_sha256", "format", "graph", "weights", "convention", "data"), str
+        ("spikeloom", "checkpoint_sha256", "train_sha256", "format", "graph", "weights", "convention", "data"), str
     ),
     **dict.fromkeys(("run", "towers", "chips"), (0, MOST)),
     **dict.fromkeys(("dt", "bin_s"), float),

@@ -153,6 +153,11 @@ class Recordings:
         """Hash over them, whatever their names."""
         return arrays_digest(self.identity())
 
+    @property
+    def events_sha256(self) -> str:
+        """Hash over their events, whatever their labels and names."""
+        return arrays_digest({name: each for name, each in self.identity().items() if name != "labels"})
+
 
 @contextmanager
 def opened(path: Path) -> Iterator[Members]:

@@ -61,6 +61,7 @@ class TrainingRecord:
     spikeloom: str
     device: str = "cpu"
     recipe: Mapping[str, Any] | None = field(default=None, metadata={"optional": True})
+    train_sha256: str | None = field(default=None, metadata={"optional": True})  # Of the events that trained
     bin_s: float | None = field(default=None, metadata={"optional": True})
     class_names: Sequence[str] | None = field(default=None, metadata={"optional": True})
     window: int | None = field(default=None, metadata={"optional": True})  # Per cent of each that trained
@@ -126,6 +127,7 @@ def training_record(
         numpy=np.__version__,
         spikeloom=__version__,
         recipe=recipe,
+        train_sha256=training.events_sha256,
         bin_s=training.bin_s,
         class_names=training.names,
         window=window,

@@ -90,7 +90,9 @@ def recordings(
         _warn_of_others(data, trained or {}, classes, whole=limit is None)
     elif labels_for is not None:
         (data,) = without_gaps(data)
-    return events.joined_bins(first_part(data, (trained or {}).get("window", WHOLE)), bins)
+    data = first_part(data, (trained or {}).get("window", WHOLE))
+    _warn_of_training(data, trained or {})
+    return events.joined_bins(data, bins)
 
 
 def _first(data: Recordings, limit: int | None) -> Recordings:
@@ -144,6 +146,16 @@ def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int, 
     elif origin and not (whole and len(data) == 1):  # a file of one recording has its own name
         advice = "calibrate on what it knows" if data.split == "train" else "are their classes the same?"
         tell(f"warning: {data.source}: {origin}{advice}")
+
+
+def _warn_of_training(data: Recordings, trained: Mapping[str, Any]) -> None:
+    """Say on stderr that what stands for new recordings is what trained the network."""
+    known = trained.get("train_sha256")
+    if known is not None and data.split != "train" and data.events_sha256 == known:
+        tell(
+            f"warning: {data.source}: these are the {number(len(data), 'recording')} that trained the network; what is "
+            "reached on them says nothing of others"
+        )
 
 
 def require_splits(path: str | Recordings) -> None:

@@ -45,6 +45,7 @@ class CountersRecord:
     validation: Held  # What cross-validation classified correctly, at this strength
     test_correct: int
     test_samples: int
+    train_sha256: str | None = field(default=None, metadata=OPTIONAL)  # Of the events that trained it
     bin_s: float | None = field(
         default=None, metadata=OPTIONAL
     )  # Seconds of a bin, where the recordings were events
@@ -108,6 +109,7 @@ def train_counters(
         ),
         test_correct=int(np.sum(decisions_of(made, test) == test.labels)),
         test_samples=len(test),
+        train_sha256=training.events_sha256,
         bin_s=training.bin_s,
         class_names=training.names,
         positions_mm=positions_mm,

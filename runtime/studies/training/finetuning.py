@@ -82,6 +82,7 @@ class FinetuneRecord:
     before: Reached
     last: ReachedLast
     history: Sequence[Sequence[float]]
+    train_sha256: str
     bin_s: float | None = field(default=None, metadata=OPTIONAL)
     class_names: Sequence[str] | None = field(default=None, metadata=OPTIONAL)
 
@@ -210,6 +211,7 @@ def _record(
         epochs=request.epochs,
         data=training.source,
         data_sha256=data_digest(training, test),
+        train_sha256=training.events_sha256,
         bin_s=training.bin_s,
         class_names=training.names,
         test_samples=len(test),

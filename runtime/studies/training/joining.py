@@ -28,6 +28,7 @@ KEPT = (
     "recipe",
     "data",
     "data_sha256",
+    "train_sha256",
     "bin_s",
     "class_names",
     "window",
