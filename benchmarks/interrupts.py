@@ -3,7 +3,8 @@
 Each trial runs a command in a folder of its own, in a process that meets a fault at one of its writes (an open to
 write, a rename, a removal, a new folder, or a flush, half of what was written) or at a random moment, over an older
 output in every other trial. Then the output must be as before, or whole. The same command, or ``--resume``, goes on; it
-must leave the bytes of an undisturbed run, and nothing else.
+must leave the bytes of an undisturbed run, and nothing else. An output that is there already gains the commands that
+it lacks.
 """
 
 import argparse
@@ -314,7 +315,10 @@ if __name__ == "__main__":
     torch.set_num_threads(1)
     typed.few_candidates()
     found: dict[str, Any] = made() | {"trials": 0, "wrong": 0, "first": {}, "faults": {}, "commands": {}}
-    for command in tqdm([name for name in COMMANDS if name.startswith(arguments.only or "")], disable=None):
+    if arguments.output.exists():
+        found = json.loads(arguments.output.read_text())
+    left = [name for name in COMMANDS if name.startswith(arguments.only or "") and name not in found["commands"]]
+    for command in tqdm(left, disable=None):
         with tempfile.TemporaryDirectory() as folder:
             made_folder(Path(folder))
             for fault, wrong in trials_of(command, Path(folder), random.Random(command)):

@@ -29,9 +29,13 @@ def touches(seed: int, samples: int) -> list[File]:
         kind = index % len(CLASSES)
         rng = np.random.default_rng([seed, index])
         time = np.sort(rng.uniform(0.01, SECONDS, 80)).round(3)
-        taxel = np.where(rng.random(80) < 0.7, 2 * kind + rng.integers(0, 2, 80), rng.integers(0, TAXELS, 80))
+        taxel = np.where(
+            rng.random(80) < 0.7, 2 * kind + rng.integers(0, 2, 80), rng.integers(0, TAXELS, 80)
+        )
         polarity = time < (0.3 + 0.2 * kind)
-        made.append((CLASSES[kind], [(t, int(n), int(p)) for t, n, p in zip(time, taxel, polarity, strict=True)]))
+        made.append(
+            (CLASSES[kind], [(t, int(n), int(p)) for t, n, p in zip(time, taxel, polarity, strict=True)])
+        )
     return made
 
 
@@ -60,7 +64,20 @@ def place(tmp_path_factory):
     for words in (
         ["train", "--system", "counters", *shared, "-o", at / "net.pt"],
         ["compile", at / "net.pt", "-o", at / "net.loom"],
-        ["train", "--system", "mlp", "--features", "2", "--hidden", "8", "--epochs", "1", *shared, "-o", at / "mlp.pt"],
+        [
+            "train",
+            "--system",
+            "mlp",
+            "--features",
+            "2",
+            "--hidden",
+            "8",
+            "--epochs",
+            "1",
+            *shared,
+            "-o",
+            at / "mlp.pt",
+        ],
         ["compile", at / "mlp.pt", "--weight-bits", "8", "-o", at / "mlp.loom"],
     ):
         code, _, err = commands.run(*words)
@@ -125,33 +142,62 @@ SWAPPED = {"cork": "foam", "foam": "cork"}
 
 LIES = (
     # taxels
-    Lie("taxels permuted", event(lambda t, n, p: (t, PERMUTED[n], p)), UNKNOWN, "recordings say no positions"),
-    Lie("taxels count from 1", event(lambda t, n, p: (t, n + 1, p)), REFUSED, "they seem to count from 1", READING),
+    Lie(
+        "taxels permuted", event(lambda t, n, p: (t, PERMUTED[n], p)), UNKNOWN, "recordings say no positions"
+    ),
+    Lie(
+        "taxels count from 1",
+        event(lambda t, n, p: (t, n + 1, p)),
+        REFUSED,
+        "they seem to count from 1",
+        READING,
+    ),
     Lie(
         "taxels count from 1, in training",
-        lambda data: event(lambda t, n, p: (t, n + 1, p), "train")(event(lambda t, n, p: (t, n + 1, p))(data)),
+        lambda data: event(lambda t, n, p: (t, n + 1, p), "train")(
+            event(lambda t, n, p: (t, n + 1, p))(data)
+        ),
         SAID,
         "if these count from 1, count from 0",
         (TRAIN,),
     ),
-    Lie("another, smaller sensor", event(lambda t, n, p: (t, n // 3, p)), SAID, "has events of taxels 0..1 only"),
+    Lie(
+        "another, smaller sensor",
+        event(lambda t, n, p: (t, n // 3, p)),
+        SAID,
+        "has events of taxels 0..1 only",
+    ),
     Lie(
         "another sensor of the same size",
         event(lambda t, n, p: (t, TAXELS - 1 - n, p)),
         UNKNOWN,
         "recordings say no more of a sensor than how many taxels there are",
     ),
-    Lie("a broken taxel", event(lambda t, n, p: (t, 0, p)), SAID, "has events of taxels 0..0 only"),
+    Lie("a broken taxel", event(lambda t, _, p: (t, 0, p)), SAID, "has events of taxels 0..0 only"),
     Lie("a taxel of -1", event(lambda t, n, p: (t, n or -1, p)), REFUSED, "taxel -1, allowed", (RUN, TRAIN)),
-    Lie("half a taxel", first(lambda rows: [(0.1, 1.5, 0), *rows]), REFUSED, "taxel 1.5, allowed", (RUN, TRAIN)),
+    Lie(
+        "half a taxel",
+        first(lambda rows: [(0.1, 1.5, 0), *rows]),
+        REFUSED,
+        "taxel 1.5, allowed",
+        (RUN, TRAIN),
+    ),
     # polarities
     Lie("polarity flipped", event(lambda t, n, p: (t, n, 1 - p)), UNKNOWN, "either may come first"),
     Lie("polarity 1 and 2", event(lambda t, n, p: (t, n, p + 1)), REFUSED, "polarity 2, allowed", READING),
     Lie("polarity -1 and 1", event(lambda t, n, p: (t, n, 2 * p - 1)), SAME, "that is the other code"),
-    Lie("polarity -1 and 0", event(lambda t, n, p: (t, n, p - 1)), REFUSED, "polarities -1 and 0 in one file"),
+    Lie(
+        "polarity -1 and 0", event(lambda t, n, p: (t, n, p - 1)), REFUSED, "polarities -1 and 0 in one file"
+    ),
     # classes
     Lie("names of classes exchanged", classes(SWAPPED), UNKNOWN, "a label is what its author says"),
-    Lie("a class that is not known", classes({"cork": "wood"}), REFUSED, "class 'wood', the network knows", READING),
+    Lie(
+        "a class that is not known",
+        classes({"cork": "wood"}),
+        REFUSED,
+        "class 'wood', the network knows",
+        READING,
+    ),
     Lie(
         "classes numbered from 1",
         classes({name: str(index + 1) for index, name in enumerate(CLASSES)}),
@@ -159,9 +205,20 @@ LIES = (
         "class '1', the network knows cork, foam, steel",
         READING,
     ),
-    Lie("recordings in another order", lambda data: data | {"test": data["test"][::-1]}, SAME, "a name has its class"),
+    Lie(
+        "recordings in another order",
+        lambda data: data | {"test": data["test"][::-1]},
+        SAME,
+        "a name has its class",
+    ),
     Lie("a class is missing in test", without("foam", "test"), SAME, "the others keep their numbers"),
-    Lie("a class is missing in training", without("steel", "train"), REFUSED, "label steel, the training", (TRAIN,)),
+    Lie(
+        "a class is missing in training",
+        without("steel", "train"),
+        REFUSED,
+        "label steel, the training",
+        (TRAIN,),
+    ),
     Lie(
         "classes of two kinds",
         classes({"cork": "1"}),
@@ -173,19 +230,62 @@ LIES = (
     # times
     Lie("events twice", each(lambda rows: [*rows, *rows]), SAME, "720 duplicates in a bin"),
     Lie("events from last to first", each(lambda rows: rows[::-1]), SAME, "711 out of order"),
-    Lie("time runs backwards", event(lambda t, n, p: (SECONDS - t, n, p)), UNKNOWN, "grasps end as they begin"),
-    Lie("negative times", event(lambda t, n, p: (t - 0.5, n, p)), REFUSED, "allowed are finite times from 0", READING),
-    Lie("a time that is none", first(lambda rows: [(float("nan"), 0, 0), *rows]), REFUSED, "time nan s", (RUN, TRAIN)),
-    Lie("an endless time", first(lambda rows: [(float("inf"), 0, 0), *rows]), REFUSED, "time inf s", (RUN, TRAIN)),
+    Lie(
+        "time runs backwards",
+        event(lambda t, n, p: (SECONDS - t, n, p)),
+        UNKNOWN,
+        "grasps end as they begin",
+    ),
+    Lie(
+        "negative times",
+        event(lambda t, n, p: (t - 0.5, n, p)),
+        REFUSED,
+        "allowed are finite times from 0",
+        READING,
+    ),
+    Lie(
+        "a time that is none",
+        first(lambda rows: [(float("nan"), 0, 0), *rows]),
+        REFUSED,
+        "time nan s",
+        (RUN, TRAIN),
+    ),
+    Lie(
+        "an endless time",
+        first(lambda rows: [(float("inf"), 0, 0), *rows]),
+        REFUSED,
+        "time inf s",
+        (RUN, TRAIN),
+    ),
     Lie("milliseconds", event(lambda t, n, p: (1000 * t, n, p)), SAID, "write seconds"),
     Lie("microseconds", event(lambda t, n, p: (1e6 * t, n, p)), REFUSED, "write seconds", READING),
-    Lie("times of a clock", event(lambda t, n, p: (1.7e9 + t, n, p)), REFUSED, "count from the start", READING),
-    Lie("times from an hour on", event(lambda t, n, p: (3600 + t, n, p)), SAID, "count times from the start"),
-    Lie("other bins are asked for", lambda data: data, REFUSED, "trained on bins of 0.05 s", (f"{RUN} --bin 0.02",)),
+    Lie(
+        "times of a clock",
+        event(lambda t, n, p: (1.7e9 + t, n, p)),
+        REFUSED,
+        "count from the start",
+        READING,
+    ),
+    Lie(
+        "times from an hour on", event(lambda t, n, p: (3600 + t, n, p)), SAID, "count times from the start"
+    ),
+    Lie(
+        "other bins are asked for",
+        lambda data: data,
+        REFUSED,
+        "trained on bins of 0.05 s",
+        (f"{RUN} --bin 0.02",),
+    ),
     Lie("silence", each(lambda rows: rows[:0]), REFUSED, "no events in any recording", READING),
     Lie("one silent recording", first(lambda rows: rows[:0]), SAID, "1 recording without events"),
     # splits
-    Lie("test is training", lambda data: data | {"test": data["train"]}, SAID, "that trained the network", READING),
+    Lie(
+        "test is training",
+        lambda data: data | {"test": data["train"]},
+        SAID,
+        "that trained the network",
+        READING,
+    ),
     Lie(
         "training and test exchanged",
         lambda data: {"train": data["test"], "test": data["train"]},

@@ -1,5 +1,6 @@
 """Sections as text and as a page, results as JSON and back; the pages of ``report`` and of a chart."""
 
+import csv
 import dataclasses
 import hashlib
 import json
@@ -17,7 +18,7 @@ import numpy as np
 import pytest
 from commands import as_json, run
 from made_chart import made_chart
-from made_files import CLASSES, FEATURES, STEPS, TAXELS, own_file, recordings_folder, weights
+from made_files import CLASSES, FEATURES, STEPS, TAXELS, events, own_file, recordings_folder, weights
 from made_nir import affine, chain, lif
 from matplotlib import rc_context
 from numpy.testing import assert_allclose, assert_array_equal
@@ -440,6 +441,39 @@ def test_names_from_a_file_run_no_script_and_tear_no_drawing(tmp_path, monkeypat
     assert "<img" not in text
     assert "<script>alert" not in text
     script = "return [document.images.length, document.querySelectorAll('[onload], [onerror]').length]"
+    assert browsed(tmp_path / "out.html", script) == [0, 0]
+
+
+def test_names_of_recordings_and_classes_do_no_harm(tmp_path, monkeypatch):
+    """Nor what a file's name does to the text around it: turning it round, or a line of its own."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "<img src=x onerror=alert(3)>"
+    classes = ["<script>alert(1)", 'a" onload="alert(2)', "\u202esteel", "two\nspikeloom: lines"]
+    rows = [("file", "label", "<i>speed")]
+    for split, samples in (("train", 12), ("test", 8)):
+        (folder / split).mkdir(parents=True)
+        for index, recording in enumerate(events(samples, samples=samples)):
+            name = f"{split}/touch {index} \u202e'\"<b>&amp;.npy"
+            np.save(folder / name, recording)
+            rows.append((name, classes[index % 4], ("<u>fast", "slow")[index % 2]))
+    with (folder / "recordings.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    for line in (
+        ["train", "--system", "counters", "-o", "net.pt"],
+        ["compile", "net.pt", "-o", "net.loom"],
+        ["run", "net.loom"],
+        ["report", "net.loom", "--checkpoint", "net.pt", "-o", "out.html"],
+    ):
+        code, out, err = run(*line, *([] if line[0] == "compile" else ["--data", folder]))
+        assert code == 0, err
+        assert "\u202e" not in out + err
+        assert not [said for said in out.splitlines() if said.startswith("spikeloom: lines")]
+    text = (tmp_path / "out.html").read_text("utf-8")
+    assert "two spikeloom: lines" in text
+    assert not [bad for bad in ("<script>alert", "<img", "<u>", "<i>speed", "<b>", "\u202e") if bad in text]
+    script = (
+        "return [document.images.length, document.querySelectorAll('[onload], [onerror], u, b, i').length]"
+    )
     assert browsed(tmp_path / "out.html", script) == [0, 0]
 
 

@@ -89,7 +89,7 @@ LINES = {
         f"{name} --config {{x}}" for name in ("run", "verify", "estimate", "certify", "compile")
     ),
     "stress": ("report {netlist} --checkpoint {network} --data {data} --stress {x} -o written/page.html",),
-    "store of smallest": ("smallest --store {x} --data {data} --jobs 1 --time 2s -o written/x.loom",),
+    "store of smallest": ("smallest --store {x} --data {data} --jobs 1 --time 9m -o written/x.loom",),
     "store of a chart": ("chart {network} --data {data} --grid bits=4,8 --jobs 1 -o written",),
 }
 

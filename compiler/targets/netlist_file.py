@@ -72,7 +72,17 @@ def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
 
 PROVENANCE: dict[str, archive.Kind] = {
     **dict.fromkeys(
-        ("spikeloom", "checkpoint_sha256", "train_sha256", "format", "graph", "weights", "convention", "data"), str
+        (
+            "spikeloom",
+            "checkpoint_sha256",
+            "train_sha256",
+            "format",
+            "graph",
+            "weights",
+            "convention",
+            "data",
+        ),
+        str,
     ),
     **dict.fromkeys(("run", "towers", "chips"), (0, MOST)),
     **dict.fromkeys(("dt", "bin_s"), float),

@@ -38,6 +38,7 @@ def class_of(text: str) -> str | None:
     >>> class_of("07"), class_of("cork 2"), class_of("-1"), class_of("1.5"), class_of("")
     ('7', 'cork 2', None, None, None)
     """
+    text = " ".join(text.split())  # a line break would tear what names it
     if is_number(text):
         return str(int(text))
     return None if not text or _OTHER.fullmatch(text) else text

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from importlib import resources
 from typing import Any
 
+from spikeloom.compiler.files import plain
 from spikeloom.runtime.report.sections import Section
 
 
@@ -34,6 +35,7 @@ def _environment() -> Any:
     environment = Environment(
         loader=PackageLoader("spikeloom.runtime.report", "."),
         autoescape=True,
+        finalize=lambda value: plain(value) if type(value) is str else value,  # not what is marked as safe
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from spikeloom.compiler.files import plain
+
 if TYPE_CHECKING:
     from spikeloom.runtime.report.drawing import Drawing
 
@@ -158,7 +160,9 @@ def _plain(block: Block) -> str:  # noqa: PLR0911 - one for each kind
 
 
 def _aligned(table: Table) -> str:
-    lines = [table.head, *table.rows[: table.most]]
+    lines = [
+        [plain(cell).replace("\n", " ") for cell in line] for line in (table.head, *table.rows[: table.most])
+    ]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
         "  "
