@@ -317,7 +317,9 @@ if __name__ == "__main__":
     found: dict[str, Any] = made() | {"trials": 0, "wrong": 0, "first": {}, "faults": {}, "commands": {}}
     if arguments.output.exists():
         found = json.loads(arguments.output.read_text())
-    left = [name for name in COMMANDS if name.startswith(arguments.only or "") and name not in found["commands"]]
+    left = [
+        name for name in COMMANDS if name.startswith(arguments.only or "") and name not in found["commands"]
+    ]
     for command in tqdm(left, disable=None):
         with tempfile.TemporaryDirectory() as folder:
             made_folder(Path(folder))

@@ -16,6 +16,7 @@ from typing import IO, Any
 import numpy as np
 
 from spikeloom.compiler.errors import DataError
+from spikeloom.compiler.files import plain
 from spikeloom.compiler.types import EventArray, FloatArray, IntArray
 from spikeloom.models.graphs import MAX_TAXELS
 from spikeloom.models.recordings.classes import class_in_name, class_of
@@ -131,7 +132,7 @@ def class_in(where: str, name: str, found: FloatArray | Sequence[str]) -> str | 
     words = list(dict.fromkeys(each if isinstance(each, str) else f"{each:g}" for each in found))
     if len(words) > 1:
         raise DataError(
-            f"{where}: labels {words[0]} and {words[1]} in one file, allowed is one; "
+            f"{where}: labels {plain(words[0])} and {plain(words[1])} in one file, allowed is one; "
             "write one file for each recording"
         )
     label = class_of(words[0])

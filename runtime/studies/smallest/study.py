@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from spikeloom.compiler import __version__
-from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.targets.base import Target
 from spikeloom.models.recordings.counts import number
@@ -92,6 +92,7 @@ class Work:
 
     store: Path
     jobs: int | None
+    recordings: int  # Of the training split
     begun: float  # By the monotonic clock
     seconds: float | None
     certify: bool
@@ -111,7 +112,7 @@ class Work:
         until = self.until(share)
         if works and until is not None and time.monotonic() >= until:
             works, until = [each for each in works if each.label == works[0].label], self.until()
-        return sweep(
+        found = sweep(
             works,
             work.measure,
             self.store,
@@ -120,6 +121,10 @@ class Work:
             kind=Measured,
             until=until,
         )
+        for key, each in found.items():
+            if not each.suits(self.recordings):
+                raise DataError(f"{self.store}: its result {key} is of other recordings; give another store")
+        return found
 
 
 def smallest(
@@ -144,6 +149,7 @@ def smallest(
     work_on = Work(
         store=store,
         jobs=jobs,
+        recordings=len(training),
         begun=time.monotonic(),
         seconds=seconds,
         certify=any(budget.what == "certified" for budget in budgets),

@@ -127,6 +127,11 @@ class Measured:
         default=None, metadata=OPTIONAL
     )  # Share that no event alters, of some left out
 
+    def suits(self, recordings: int) -> bool:
+        """Whether it counts so many recordings, and none was right more often than it was decided."""
+        pairs = list(zip(self.right, self.tried, strict=False))
+        return len(self.right) == len(self.tried) == recordings and all(0 <= r <= t for r, t in pairs)
+
     @property
     def shares(self) -> FloatArray:
         """How often each recording was decided rightly; NaN where it was not decided; shape (recordings,)."""
