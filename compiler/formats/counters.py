@@ -138,8 +138,10 @@ def read_network(path: str | os.PathLike[str]) -> ReadNetwork[Network]:
         f"{len(counters.counter)} counters of {thresholds} events{parts}; {counters.steps} steps count, then "
         f"{counters.ramp} to read out"
     )
+    with reading(path, ModelError, archive.AGAIN):
+        network = counting_network(counters)
     return ReadNetwork(
-        network=counting_network(counters),
+        network=network,
         facts=(fact,),
         sha256=sha256,
         training={**counters.training, "steps": counters.steps},
