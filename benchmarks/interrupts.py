@@ -57,6 +57,9 @@ COMMANDS = {
     "data convert, a zip": "data convert taps -o out/x.zip",
     "certify": "certify net.loom --data data --limit 2 --shift 1 --most 2 --jobs 1 --certificate out/x -o out/x.json",
     "export": "export net.loom --to onnx -o out/x.onnx",
+    "export, NIR": "export net.loom --to nir -o out/x.nir",
+    "join": "join net.pt net.pt -o out/x.pt",
+    "run": "run net.loom --data data --spikes out/x.npz",
 }
 RESUMED = "train", "finetune"
 """Commands that go on with ``--resume`` where a state is there."""
