@@ -83,7 +83,7 @@ export sanafe:
     bytes cores format groups input_cores neurons path sha256 synapses
 finetune:
     before bin_s? command data data_sha256 epochs file fine_tuned_from fine_tuned_weights history last netlist? seed
-    sha256 test_samples weight_bits
+    sha256 test_samples train_sha256 weight_bits
 inspect checkpoint:
     assumed beta classes given graph layers layout sha256 system taxels theta training bins? dynamics? hops? towers?
 inspect checkpoint, crossbars:
