@@ -197,12 +197,9 @@ def values_in(name: str, content: bytes) -> Any:
 
 
 def is_passing(name: str) -> bool:
-    """Whether a file is one of those that a command leaves for the next one to go on with."""
-    return (
-        name.endswith((".part", ".lock", ".sqlite", ".sqlite-journal"))
-        or ".state" in name
-        or ".training" in name
-    )
+    """Whether a file is one of those that a command leaves for the next one to go on with, or to remove."""
+    left = (".part", ".lock", ".state", ".training", ".sqlite")
+    return any(part in name for part in left)
 
 
 @dataclass
