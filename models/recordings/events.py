@@ -300,6 +300,8 @@ def join_bins(events: AnyArray, bins: int) -> AnyArray:
     >>> join_bins(np.array([[0, 1, 0, 0, 1]], np.uint8), 2).tolist()
     [[1, 0, 1]]
     """
+    if bins == 1:
+        return events.copy()
     return np.maximum.reduceat(events, np.arange(0, events.shape[-1], bins), axis=-1)
 
 

@@ -223,14 +223,25 @@ def _part(
 
 
 @compiled
-def _over(chip: Chip, known: Known, bounds: Safe, run: Any, t: Any) -> Any:
-    """Whether all that differs is safe, so that spikes are the known ones from here on."""
+def _settle(chip: Chip, known: Known, bounds: Safe, run: Any, t: Any, moved: Any) -> Any:
+    """Let go of blocks that spike as in the known run from step `t` on; whether any is left."""
+    registers = run.current, run.current, run.membrane, run.membrane
+    unsafe_ones = run.looked
+    first = len(chip.depth)  # layer from which a spike still may differ: later ones must wait
+    if moved:
+        first = chip.layer[(run.moved[0] - len(known.events)) // LANES]
     for block in range(len(chip.depth)):
-        if run.held[block] and unsafe(
-            chip, known, bounds, (run.current, run.current, run.membrane, run.membrane), t, block
-        ):
-            return False
-    return True
+        unsafe_ones[block] = run.held[block] and unsafe(chip, known, bounds, registers, t, block)
+        if unsafe_ones[block]:
+            first = min(first, chip.layer[block])
+    if not chip.ordered and first < len(chip.depth):
+        return True
+    any_held = False
+    for block in range(len(chip.depth)):
+        if chip.layer[block] <= first:
+            run.held[block] = unsafe_ones[block]
+        any_held |= run.held[block] != 0
+    return any_held
 
 
 @compiled_and_cached
@@ -248,6 +259,7 @@ def _run(
 ) -> None:
     steps = len(known.sums)
     blocks = len(chip.depth)
+    looked = run.looked
     for k in range(len(end)):
         flip = bounds[k]
         last = bounds[k + 1]
@@ -256,7 +268,9 @@ def _run(
         t = np.int64(0)
         clear(run.held)
         while True:
-            if moved == 0 and (not any_held or (flip == last and _over(chip, known, bounds_, run, t))):
+            if any_held and flip == last:
+                any_held = _settle(chip, known, bounds_, run, t, moved)
+            if moved == 0 and not any_held:
                 end[k] = t
                 if flip == last:
                     break
@@ -275,9 +289,10 @@ def _run(
             any_held = False
             block = 0
             while block < blocks:
-                after = _span(chip, known, run, t, block)
-                if after > block:
+                after = block + 1
+                if looked[block]:
+                    after = _span(chip, known, run, t, block)
                     moved, differs = _part(chip, known, run, t, moved, (block, after), come[k], gone[k])
                     any_held |= differs
-                block = max(after, block + 1)
+                block = after
             t += 1

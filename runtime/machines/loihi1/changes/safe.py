@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spikeloom.compiler.layer_kernel import compiled
+from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached
 from spikeloom.compiler.targets.loihi1.registers import DECAY_ONE, MEMBRANE_MAX
-from spikeloom.compiler.types import AnyArray, IntArray
+from spikeloom.compiler.types import AnyArray
 from spikeloom.runtime.machines.loihi1.changes.chip import LANES, Chip, Known
 
 FAR = 1 << 30
@@ -31,31 +31,35 @@ def safe(chip: Chip, known: Known) -> Safe:
     """Safe membranes of a known run."""
     steps, places = known.fired.shape
     bounds = Safe(*np.zeros((2, steps + 1, places), np.int32))
-    length = known.events.shape[1]
-    low, high = np.full(places, -FAR, np.int64), np.full(places, FAR, np.int64)
-    depth = np.repeat(chip.depth, LANES)
-    keep = chip.keep_v.astype(np.int64)
-    bounds.low[steps], bounds.high[steps] = low, high
-    for t in range(steps - 1, -1, -1):
-        fired = known.fired[t] != 0
-        arrived = known.current[t + 1].astype(np.int64) + chip.bias
-        least = np.where(fired, chip.threshold.astype(np.int64) + 1, low)
-        most = np.where(fired, FAR, np.minimum(chip.threshold, high))
-        low = np.where(least <= -MEMBRANE_MAX, -FAR, -_reached(arrived - least, keep))
-        high = np.where(most >= MEMBRANE_MAX, FAR, _reached(most - arrived, keep))
-        inside = (depth <= t) & (t < depth + length)
-        low, high = np.where(inside, low, -FAR), np.where(inside, high, FAR)
-        bounds.low[t], bounds.high[t] = low, high
+    bounds.low[steps], bounds.high[steps] = -FAR, FAR
+    _backwards(chip, known, bounds)
     return bounds
 
 
-def _reached(most: IntArray, keep: IntArray) -> IntArray:
+@compiled_and_cached
+def _backwards(chip: Chip, known: Known, bounds: Safe) -> None:
+    length = known.events.shape[1]
+    for t in range(len(known.fired) - 1, -1, -1):
+        for i in range(len(chip.bias)):
+            depth = chip.depth[i // LANES]
+            fired = known.fired[t, i] != 0
+            least = chip.threshold[i] + 1 if fired else bounds.low[t + 1, i]
+            most = FAR if fired else min(chip.threshold[i], bounds.high[t + 1, i])
+            arrived = np.int64(known.current[t + 1, i]) + chip.bias[i]
+            inside = depth <= t < depth + length
+            ends_below = inside and least > -MEMBRANE_MAX
+            ends_above = inside and most < MEMBRANE_MAX
+            bounds.low[t, i] = -_reached(arrived - least, chip.keep_v[i]) if ends_below else -FAR
+            bounds.high[t, i] = _reached(most - arrived, chip.keep_v[i]) if ends_above else FAR
+
+
+@compiled
+def _reached(most: Any, keep: Any) -> Any:
     """Largest membrane of which no more than `most` is kept, within FAR."""
-    keeps = np.maximum(keep, 1)
-    above = ((most + 1) * DECAY_ONE - 1) // keeps  # of what is not negative
-    below = -((-most * DECAY_ONE + keeps - 1) // keeps)  # of what is: its magnitude is at least so much
-    nothing = np.where(most >= 0, FAR, -FAR)
-    return np.clip(np.where(keep == 0, nothing, np.where(most >= 0, above, below)), -FAR, FAR)
+    product = most * DECAY_ONE + (DECAY_ONE - 1 if most >= 0 else 0)  # decay rounds toward zero
+    if keep == 0:
+        return FAR if product > 0 else -FAR
+    return min(max(product // keep, -FAR), FAR)
 
 
 @compiled
