@@ -77,7 +77,7 @@ if __name__ == "__main__":
         )
         row["networks"] += 1
         for one in sparse_events(row["networks"], 2, taxels, 2, STEPS, rate=0.25):
-            proof = certificate(machine, one, 0, "", shift=0, most=MOST, tally=tally_of(machine))
+            proof = certificate(machine, (one, 0, ""), shift=0, most=MOST, tally=tally_of(machine))
             alters = 0
             for events in range(1, MOST + 1):
                 tried, wrong = altered(machine, one, events, proof.decision)
