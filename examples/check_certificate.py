@@ -10,6 +10,8 @@ again from the netlist, whose hash is compared, and the chip's integers, by thes
 and spikes on their way) go on alike, so one of them stands for both, with the most votes of either for each class
 beyond those of the decision.
 
+*k events of counters* (Loihi): see ``check_counts.py``.
+
 *k events* (Loihi). Let events change at the steps t1 < t2 < …; those of one step are a *group*. A vote sees an event
 `lag` steps later at the earliest. So votes before t1 + lag are the known ones, and those from ti + lag to before
 ti+1 + lag depend on no group after i. ``turned`` bounds how many of these can turn, whatever there was until group
@@ -26,6 +28,7 @@ import hashlib
 import json
 import sys
 from pathlib import Path
+from runpy import run_path
 
 import numpy as np
 
@@ -221,9 +224,7 @@ def run(chip, events, flips, decision):
     state, counts = chip.start(events.shape[1]), []
     states = [state]
     ahead = np.zeros((1, chip.classes), np.int64)  # votes beyond those of the decision
-    over = np.zeros(
-        chip.classes, np.int64
-    )  # the same of runs that have become the known one, beyond its own
+    over = np.zeros(chip.classes, np.int64)  # the same of runs that have become the known one
     for t in range(events.shape[1] * chip.bin_ticks + chip.drain):
         step, later = divmod(t, chip.bin_ticks)
         seen = np.zeros((len(ahead), len(events)), np.bool_)
@@ -352,12 +353,16 @@ def check(chip, events, bins, claim):
     states, counts, alters = run(chip, events, single if rule == 1 else none, decision)
     require(counts.sum(axis=0).argmax() == decision, "the decision")
     require(
-        rule in (0, 1, 2, 3) and k <= {0: 0, 1: 1}.get(rule, k),
+        rule in (0, 1, 2, 3, 4) and k <= {0: 0, 1: 1}.get(rule, k),
         f"{k} events, which rule {rule} cannot prove",
     )
     require(not alters, "that no single event alters the decision")
-    if rule > 1:
-        require(isinstance(chip, Loihi), f"rule {rule}, which is for Loihi")
+    require(rule < 2 or isinstance(chip, Loihi), f"rule {rule}, which is for Loihi")
+    if rule == 4:
+        rules = run_path(str(Path(__file__).with_name("check_counts.py")))
+        proven = rules["Counts"](chip, require).none_of(k, events, bins, decision)
+        require(proven, f"that no {k} events alter the decision")
+    elif rule > 1:
         bounds = Bounds(chip, events, flips[:, : bins.shape[1]], decision, states, counts)
         require(bounds.none_of(k, [1] if rule == 2 else APART), f"that no {k} events alter the decision")
     if len(changes):

@@ -10,13 +10,17 @@ from pathlib import Path
 from runpy import run_path
 
 import numpy as np
+import pytest
 from commands import run
 from made_files import events, recordings_folder
+from random_crossbars import random_counters
 from test_stability import small_netlist
 from zoo import MAKERS, over, specimen
 
 from spikeloom.compiler.archive import archive_bytes, read_members
+from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.targets.loihi1.netlist import write_netlist
+from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.studies.robustness.proofs.entries import channels_of
 
 CHECKER = Path(__file__).parents[1] / "examples" / "check_certificate.py"
@@ -41,8 +45,9 @@ def checked(folder, netlist, members):
     return done.returncode, done.stdout + done.stderr
 
 
-def test_the_checker_needs_numpy_alone_and_is_short():
-    text = CHECKER.read_text()
+@pytest.mark.parametrize("name", ["check_certificate.py", "check_counts.py"])
+def test_the_checker_needs_numpy_alone_and_is_short(name):
+    text = CHECKER.with_name(name).read_text()
     tree = ast.parse(text)
     names = {
         name.split(".")[0]
@@ -114,6 +119,38 @@ def test_certificates_of_several_events_hold_and_planted_errors_do_not(tmp_path)
     code, said = checked(tmp_path, tmp_path / "other.loom", good)
     assert code == 1
     assert "another netlist" in said
+
+
+@pytest.mark.parametrize(("seed", "parts"), [(4, 1), (0, 2), (4, 2)])
+def test_certificates_of_counters_hold_and_planted_errors_do_not(tmp_path, seed, parts):
+    counters = random_counters(seed, taxels=2, parts=parts)
+    write_netlist(compile_network(counting_network(counters)).netlist, tmp_path / "net.loom")
+    test = events(seed, samples=3, taxels=2, steps=14, rate=0.25)
+    recordings_folder(tmp_path / "data", test=test)
+    good = certified(tmp_path, tmp_path / "net.loom", tmp_path / "data")
+    code, said = checked(tmp_path, tmp_path / "net.loom", good)
+    assert code == 0, said
+    assert good["rule"].max() == 4
+    assert good["unaltered"].max() >= 2
+    fallen, by_counts = np.diff(good["change_bounds"]), {"rule": np.full_like(good["rule"], 4)}
+    if fallen.any():  # by so many: the certificates are of the largest number that can be
+        code, said = checked(tmp_path, tmp_path / "net.loom", good | by_counts | {"unaltered": fallen})
+        assert code == 1
+        assert "events alter the decision" in said
+    else:
+        code, said = checked(tmp_path, tmp_path / "net.loom", good | {"unaltered": good["unaltered"] + 20})
+        assert code == 1
+        assert "no sum saturates" in said
+
+
+@over(["tactilesgnet", "counters-crossbars"])
+def test_numbers_of_events_are_believed_of_no_network_but_counters_on_loihi(tmp_path, name):
+    made = specimen(name)
+    good = certified(tmp_path, made.netlist, made.data, "--most", "1")
+    planted = {"rule": np.full_like(good["rule"], 4), "unaltered": good["unaltered"] * 2}
+    code, said = checked(tmp_path, made.netlist, good | planted)
+    assert code == 1
+    assert "counting network" in said or "which is for Loihi" in said
 
 
 @over(["tactilesgnet", "counters", "native", "counters-crossbars"])

@@ -35,8 +35,9 @@ from spikeloom.runtime.studies.robustness.results import (
 )
 from spikeloom.runtime.studies.robustness.threads import in_threads
 
-EACH, ANY, NEAR = 1, 2, 3
-"""Rules of a certificate: each single event was run; bounds of groups, whatever came before; by their distance, too."""
+EACH, ANY, NEAR, COUNTS = 1, 2, 3, 4
+"""Rules of a certificate: each single event was run; bounds of groups, whatever came before; by their distance, too;
+what counters make of other numbers of events."""
 
 PROBED = 64
 """Single events whose time tells that of all."""
@@ -238,6 +239,7 @@ def _bounds(machine: Machine, singles: _Singles, most: int) -> tuple[int, IntArr
         at_least = rule = 0
     elif singles.counted is not None:
         at_least, fewest = singles.counted
+        rule = COUNTS
         flips = flips if fewest is None else fewest
     elif singles.effects is None:
         at_least, rule = 1, ANY

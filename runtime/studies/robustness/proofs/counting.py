@@ -11,13 +11,14 @@ threshold before the last event are bounded: an event more or less alters one co
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spikeloom.compiler.counters import BLOCK
 from spikeloom.compiler.ir import Sparse, added_up
-from spikeloom.compiler.targets.compartments import MEMBRANE_SHIFT, IntegerNetwork
+from spikeloom.compiler.targets.compartments import MEMBRANE_MAX, MEMBRANE_SHIFT, IntegerNetwork
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.machines.capabilities import Comparable
@@ -27,7 +28,7 @@ FAR = 1 << 40
 """Beyond every sum."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Tally:
     """A counting network as whole numbers in membrane units."""
 
@@ -45,6 +46,13 @@ class Tally:
         count = self.count[those]
         times = np.where(events < count, 0, 1 + (events - count) // (count + BLOCK))
         return np.asarray(times @ self.weight[:, those].T)
+
+    @cached_property
+    def largest(self) -> int:
+        """Most that an event adds to a sum, or takes from it."""
+        counts = np.arange(self.steps + 1)[:, None]
+        each = (self.of(np.flatnonzero(self.group == group), counts) for group in np.unique(self.group))
+        return max(int(np.abs(np.diff(sums, axis=0)).max()) for sums in each)
 
     def groups(self, channel: IntArray, step: IntArray) -> IntArray:
         """Groups of entries."""
@@ -122,6 +130,8 @@ def least(
     crossing = np.where(above.any(axis=0), above.argmax(axis=0), tally.steps)
     last = int(cells.cells[-1, 1])
     decision = int(np.argmax(votes))
+    room = MEMBRANE_MAX + int(membranes.min())
+    most = min(most, max(room - 1, 0) // max(tally.largest, 1))  # beyond that a sum might saturate
     early = _early(tally, recording, np.delete(membranes, decision, axis=1)[: last + 1], decision, most)
     if np.any(tally.steps - crossing != votes) or crossing[decision] <= last or early < 2:
         return None
@@ -168,8 +178,7 @@ def _early(tally: Tally, recording: BoolArray, membranes: IntArray, decision: in
     """
     others = np.delete(np.arange(len(tally.weight)), decision)
     events = tally.events(recording)[: len(membranes)]
-    step = most * int(np.abs(tally.weight[others]).max())  # by the largest weight of all
-    near = np.flatnonzero((membranes + step > tally.threshold).any(axis=1))
+    near = np.flatnonzero((membranes + most * tally.largest > tally.threshold).any(axis=1))
     lead = np.zeros((most + 1, len(near), len(others)), np.int64)
     for each in np.unique(tally.group).tolist():
         counters = np.flatnonzero(tally.group == each)
