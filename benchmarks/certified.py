@@ -13,6 +13,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 from made import made
+from PIL import Image
 
 RESULTS = Path(__file__).parent / "results"
 MOST = 4
@@ -52,7 +53,7 @@ def certified() -> dict[str, Any]:
 
 def draw(found: dict[str, Any], file: Path) -> None:
     """Share of all recordings over the number of events."""
-    figure, panels = plt.subplots(1, len(found), figsize=(8.4, 2.9), sharey=True, layout="constrained")
+    figure, panels = plt.subplots(1, len(found), figsize=(8, 2.8), layout="constrained")
     for panel, (data, shown) in zip(panels, found.items(), strict=True):
         for name, counts in shown["right"].items():
             shares = [100 * count / shown["recordings"] for count in counts]
@@ -62,8 +63,8 @@ def draw(found: dict[str, Any], file: Path) -> None:
         panel.spines[["top", "right"]].set_visible(False)
         panel.legend(frameon=False, fontsize=8)
     panels[0].set_ylabel("right and proven to stay so, %")
-    panels[0].set_ylim(0, 100)
     figure.savefig(file, dpi=80)
+    Image.open(file).quantize(32).save(file, optimize=True)
 
 
 if __name__ == "__main__":
