@@ -231,15 +231,15 @@ def _settle(chip: Chip, known: Known, bounds: Safe, run: Any, t: Any, moved: Any
     if moved:
         first = chip.layer[(run.moved[0] - len(known.events)) // LANES]
     for block in range(len(chip.depth)):
-        unsafe_ones[block] = run.held[block] and unsafe(chip, known, bounds, registers, t, block)
+        waits = chip.layer[block] > first
+        unsafe_ones[block] = run.held[block] and (waits or unsafe(chip, known, bounds, registers, t, block))
         if unsafe_ones[block]:
             first = min(first, chip.layer[block])
     if not chip.ordered and first < len(chip.depth):
         return True
     any_held = False
     for block in range(len(chip.depth)):
-        if chip.layer[block] <= first:
-            run.held[block] = unsafe_ones[block]
+        run.held[block] = unsafe_ones[block]
         any_held |= run.held[block] != 0
     return any_held
 
