@@ -166,3 +166,14 @@ def test_certificates_of_single_events_are_checked_on_both_chips(tmp_path, name)
         code, said = checked(tmp_path, made.netlist, good | each)
         assert code == 1
         assert "no single event" in said
+
+
+def test_proofs_stand_against_all_inputs_of_random_networks(tmp_path, monkeypatch):
+    script = CHECKER.parents[1] / "benchmarks" / "soundness.py"
+    monkeypatch.syspath_prepend(str(script.parent))
+    monkeypatch.setattr(sys, "argv", [str(script), str(tmp_path / "found.json"), "--networks", "5"])
+    run_path(str(script), run_name="__main__")
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert found["tried"] > 1000
+    assert found["wrong"] == 0
+    assert set(found["by_kind"]) == {"counters", "layers"}
