@@ -130,9 +130,8 @@ class Loihi(Chip):
         self.depth = np.array([layer["depth"] for layer in about["layers"]])[a["layer"]]
         self.drain = int(self.depth.max())
         up, down = (64 * np.bincount(target, (s * weight).clip(0), n).astype(np.int64) for s in (1, -1))
-        self.most = [
-            each * 4096 // (4096 - self.keep_u) for each in (-down, up)
-        ]  # currents, whatever the input
+        # least and most currents, whatever the input
+        self.most = [each * 4096 // (4096 - self.keep_u) for each in (-down, up)]
         overflows = (np.maximum(up, down) >= 2**21) | (np.abs(self.most).max(axis=0) > LIMIT)
         require(not overflows.any(), "a register may overflow")
 
@@ -300,12 +299,8 @@ class Bounds:
             state, (fewest, most) = chip.tick(state, (sure, may), s)
             r = s + 1 - t - self.lag
             if r > 0:
-                lost = (
-                    lost
-                    + (self.counts[s, self.decision] - fewest[:, [self.decision]])
-                    + most
-                    - self.counts[s]
-                )
+                known = self.counts[s]
+                lost = lost + (known[self.decision] - fewest[:, [self.decision]]) + most - known
                 if s + 1 == t + HORIZON:
                     rest = self.counts[s + 1 :]
                     voters = np.bincount(chip.label[chip.label >= 0], minlength=chip.classes)
@@ -352,10 +347,8 @@ def check(chip, events, bins, claim):
     single[: len(bins), : bins.shape[1]] = bins <= 1
     states, counts, alters = run(chip, events, single if rule == 1 else none, decision)
     require(counts.sum(axis=0).argmax() == decision, "the decision")
-    require(
-        rule in (0, 1, 2, 3, 4) and k <= {0: 0, 1: 1}.get(rule, k),
-        f"{k} events, which rule {rule} cannot prove",
-    )
+    most = {0: 0, 1: 1, 2: k, 3: k, 4: k}.get(rule, -1)
+    require(k <= most, f"{k} events, which rule {rule} cannot prove")
     require(not alters, "that no single event alters the decision")
     require(rule < 2 or isinstance(chip, Loihi), f"rule {rule}, which is for Loihi")
     if rule == 4:
