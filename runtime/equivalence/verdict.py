@@ -106,15 +106,15 @@ class Verdict(Shown):
     Predictions are (samples,) int64 and votes (samples, classes) int64; those of the float model are None
     where the network is whole numbers and there is none.
 
-    netlist: level EN. spec_samples, spec_different: recordings on which the specification ran beside the
-    engine, of a free-running netlist
-        also in a row; spikes, membranes and counts that differed.
-    engine, engine_different: the further engine, and its spikes and votes that are not our engine's. model:
-    level E1 by layer; None where the network brings no whole-number model of its own. membranes_saturated:
-    membranes that left their register, which the model's do not; None where the chip saturates
-        by definition.
-    spikes, ladder, first_divergence: level E2; empty where layers of the chip are not those of a float
-    model. not_compared: neurons of each layer that the chip omits because their spikes reach no neuron.
+    netlist: level EN.
+    spec_samples, spec_different: recordings on which the specification ran beside the engine, of a
+        free-running netlist also in a row; spikes, membranes and counts that differed.
+    engine, engine_different: the further engine, and its spikes and votes that are not our engine's.
+    model: level E1 by layer; None where the network brings no whole-number model of its own.
+    membranes_saturated: membranes that left their register, which the model's do not; None where the chip
+        saturates by definition.
+    spikes, ladder, first_divergence: level E2; empty where layers of the chip are not those of a float model.
+    not_compared: neurons of each layer that the chip omits because their spikes reach no neuron.
     row_different: decisions that differ where all recordings follow each other on a free-running chip.
     required: shares that levels have to reach; EN always.
     """

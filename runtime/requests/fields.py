@@ -133,7 +133,7 @@ def documented(kind: type[Request]) -> Callable[[F], F]:
     """Add what a request says of its fields to the parameters in the documentation of its Python function."""
 
     def decorate(function: F) -> F:
-        text, raises, errors = inspect.cleandoc(function.__doc__ or "").partition("\n\nRaises")
+        text, raises, errors = inspect.cleandoc(function.__doc__ or "").partition("\n\nRaises\n---")
         options = {each.name: each for each in kind.options()}
         lines = [] if HEADING in text else ["", HEADING]
         for name, annotation in function.__annotations__.items():
