@@ -1,12 +1,14 @@
 """The command line: name the commands, import the one that is chosen, run it, print what it returns.
 
 Exit codes: 0 fine, 1 a check failed, 2 an interrupt or a user's mistake (one line on stderr, a traceback
-only with ``--debug``). Results go to stdout, progress to stderr when it is a terminal.
+only with ``--debug``). Results go to stdout, progress to stderr, when it is a terminal or
+``--progress json`` asks.
 """
 
 import argparse
 import difflib
 import json
+import os
 import shlex
 import sys
 from collections.abc import Iterable, Sequence
@@ -17,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import CapacityError, OptionError, SpikeloomError, UnfinishedError
 from spikeloom.compiler.files import WRITTEN
+from spikeloom.models.progress import FORM
 
 if TYPE_CHECKING:
     from spikeloom.runtime.report.sections import Outcome
@@ -201,6 +204,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             from spikeloom.runtime.commands.config import write_config
 
             write_config(arguments.write_config, arguments.config_table, request)
+        if arguments.progress is not None:
+            os.environ[FORM] = arguments.progress
         outcome: Outcome = arguments.action(request)
         text = (
             json.dumps(encode(outcome.result))

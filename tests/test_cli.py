@@ -25,6 +25,7 @@ from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.loihi1.passes import PASSES
 from spikeloom.models.graphs import build_graph
+from spikeloom.models.progress import FORM
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence import reference
@@ -279,6 +280,21 @@ def test_progress_goes_to_a_terminal_only(monkeypatch, capsys):
     json.loads(capsys.readouterr().out)
     assert "\r\x1b[Krunning: 0 of 6 …" in terminal.getvalue()
     assert terminal.getvalue().endswith("\r\x1b[K")  # and cleared
+
+
+def test_progress_for_programs_is_lines_of_json(spikeloom, monkeypatch, capsys, tmp_path):
+    monkeypatch.setenv(FORM, "")  # so that it is unset afterwards
+    assert cli.main(["run", "net.loom", "--data", "data", "--json", "--progress", "json"]) == 0
+    out, err = capsys.readouterr()
+    json.loads(out)
+    lines = [json.loads(line) for line in err.splitlines()]
+    assert {"label": "running", "done": 0, "total": 6} in lines
+    assert all(line["label"] for line in lines)
+    words = ["train", "--data", "data", "--taxels", str(TAXELS), "--system", "mlp", "--epochs", "2"]
+    words += ["-o", str(tmp_path / "x.pt")]
+    assert cli.main(words) == 0
+    epochs = [json.loads(line) for line in capsys.readouterr().err.splitlines() if line.startswith("{")]
+    assert [line["done"] for line in epochs if line["label"] == "seed 0, all data"] == [1, 2]
 
 
 def test_a_reader_that_leaves_early_is_no_mistake(spikeloom, monkeypatch):

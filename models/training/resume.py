@@ -15,6 +15,7 @@ from spikeloom.compiler.archive import stored_members, zip_bytes
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import FileFault, read_whole, reading, write_atomically
 from spikeloom.models.networks.networks import Weights
+from spikeloom.models.progress import lines_wanted, say
 
 E = TypeVar("E")
 
@@ -48,7 +49,12 @@ class Course(Generic[E]):
         """Train the epochs that are left, by their index, with a progress bar; write the `state` after each."""
         done = len(self.history)
         with tqdm(
-            total=epochs, initial=done, desc=label, unit="epoch", position=position, disable=None
+            total=epochs,
+            initial=done,
+            desc=label,
+            unit="epoch",
+            position=position,
+            disable=lines_wanted() or None,  # without a terminal
         ) as bar:
             for index in range(done, epochs):
                 self.history.append(train_epoch(index))
@@ -56,6 +62,7 @@ class Course(Generic[E]):
                     self.write(state)
                 bar.set_postfix(shown(self.history[-1]))
                 bar.update()
+                say(label, done=index + 1, total=epochs)
                 if after_epoch is not None:
                     after_epoch(self.history[-1])
 

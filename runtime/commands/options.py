@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import Field
 from typing import Any, TypeVar
 
+from spikeloom.models.progress import FORM, LINES
 from spikeloom.runtime.requests.fields import Request, has_default, kind_of
 
 R = TypeVar("R", bound=Request)
@@ -103,4 +104,9 @@ def add_common(parser: argparse.ArgumentParser) -> None:
         "--config", metavar="FILE.toml", help="options from the file's table of this command"
     )
     common.add_argument("--write-config", metavar="FILE.toml", help="write these options as such a file")
+    common.add_argument(
+        "--progress",
+        choices=(LINES,),
+        help=f"how far it is as lines of JSON on standard error (everywhere: {FORM}={LINES})",
+    )
     common.add_argument("--debug", action="store_true", help="show a traceback on errors")

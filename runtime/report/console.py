@@ -5,11 +5,15 @@ import sys
 import time
 
 from spikeloom.compiler.files import one_line, plain
+from spikeloom.models.progress import lines_wanted, say
 
 
 def progress(label: str) -> None:
-    """Say on a terminal what is being done; an empty label wipes the line."""
-    if sys.stderr.isatty():
+    """Say what is being done, on a terminal or to a program; an empty label wipes the line."""
+    if lines_wanted():
+        if label:
+            say(label)
+    elif sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[K{plain(label)} …" if label else "\r\x1b[K")
         sys.stderr.flush()
 
@@ -20,7 +24,7 @@ def tell(text: str) -> None:
 
 
 class Progress:
-    """Says on a terminal how many of `total` parts of some work are done, and how long the others will take."""
+    """Says how many of `total` parts of some work are done, and how long the others will take."""
 
     def __init__(self, total: int) -> None:
         self._total = total
@@ -30,6 +34,9 @@ class Progress:
         """So many are done; the `label` is of the next."""
         spent = time.perf_counter() - self._begun
         left = round(spent * (self._total - done) / done) if done else 0
+        if lines_wanted():
+            say(label, done=done, total=self._total, left_s=left if done else None)
+            return
         ahead = f", {left // 60}:{left % 60:02} left" if left else ""
         progress(f"{label}: {done} of {self._total}{ahead}" if self._total > 1 else label)
 
