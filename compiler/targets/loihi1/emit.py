@@ -74,13 +74,17 @@ def _axons(
                 dense, _ = core_needs.choose_dense(
                     lists, projection, base, chunk.size, lean=lean, target=target
                 )
-                keys = [(projection.bits, projection.exponent, 0 if flag else index) for flag in dense]
-                formats = np.array([number.setdefault(key, len(number)) for key in keys])
+                flags, seen, which = np.unique(dense, return_index=True, return_inverse=True)
+                keys = [(projection.bits, projection.exponent, 0 if flag else index) for flag in flags]
+                for at in np.argsort(seen):
+                    number.setdefault(keys[at], len(number))
+                formats = np.array([number[key] for key in keys], np.int64)[which]
                 source = lists.source
                 if projection.pre != INPUT:
                     source = network.input.size + compartment_id[projection.pre][source]
                 per_core[core] += len(source)
                 columns.append((source, formats, *_entries(lists, dense, base)))
+            needs.drop(chunk)  # all of them would be as much as the netlist
             base += chunk.size
     source, formats, length, place, weight = map(np.concatenate, zip(*columns, strict=True))
     return {

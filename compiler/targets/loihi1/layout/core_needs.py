@@ -17,6 +17,9 @@ from spikeloom.compiler.types import IntArray
 SPARSE_SHARE = 0.75
 """A list goes sparse when it stores at most this share of what the dense form would store and visit."""
 
+ADDED = ("core.compartments", "core.axons_in", "core.axons_out")
+"""Limits of which a core uses as much as its chunks do together."""
+
 SynapseFormat = tuple[int, int, int]
 """Weight bits, exponent and index bits (0 if dense)."""
 
@@ -49,7 +52,7 @@ class Lists:
     projection: int  # Index in the network
     source: IntArray  # (lists,) int64; neuron of the source population
     nonzero: IntArray  # (lists,) int64; non-zero synapses of each list
-    row: IntArray  # (synapses,); neuron within the chunk, ascending in each list
+    row: IntArray  # (synapses,) int16; neuron within the chunk, ascending in each list
     mantissa: IntArray  # (synapses,); non-zero weight
     first: IntArray  # (lists,) int64; first row of each list
     last: IntArray  # (lists,) int64; last row of each list
@@ -63,7 +66,7 @@ def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
             part = projection.weight[chunk.first : chunk.last].tocsc()
             part.eliminate_zeros()
             bounds = part.indptr.astype(np.int64)
-            row = part.indices.astype(np.int64)
+            row = part.indices.astype(np.int16)  # a core has few enough, and lists are most of what is held
             source = np.flatnonzero(np.diff(bounds))
             into = Lists(
                 projection=index,
@@ -71,11 +74,28 @@ def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
                 nonzero=np.diff(bounds)[source],
                 row=row,
                 mantissa=part.data,
-                first=row[bounds[source]],
-                last=row[bounds[source + 1] - 1],
+                first=row[bounds[source]].astype(np.int64),
+                last=row[bounds[source + 1] - 1].astype(np.int64),
             )
             collected.append(into)
     return tuple(collected)
+
+
+def lists_of_first(lists: Lists, size: int) -> Lists:
+    """What is left of the lists into a chunk for its first neurons."""
+    kept = lists.row < size
+    nonzero = np.add.reduceat(kept, np.cumsum(lists.nonzero) - lists.nonzero, dtype=np.int64)
+    some = nonzero > 0
+    row = lists.row[kept]
+    return Lists(
+        projection=lists.projection,
+        source=lists.source[some],
+        nonzero=nonzero[some],
+        row=row,
+        mantissa=lists.mantissa[kept],
+        first=lists.first[some],
+        last=row[np.cumsum(nonzero[some]) - 1].astype(np.int64),
+    )
 
 
 def index_bits(highest: int, target: Target) -> int:
@@ -107,14 +127,31 @@ class Needs:
         self.target = target
         self.forget()
         self._lists: dict[Chunk, tuple[Lists, ...]] = {}
+        self._longest: tuple[Chunk, tuple[Lists, ...]] | None = None
         self._stored: dict[tuple[Chunk, int, bool, bool], tuple[int, frozenset[SynapseFormat]]] = {}
         self._lean: dict[Core, bool] = {}
 
     def lists(self, chunk: Chunk) -> tuple[Lists, ...]:
         """Synapse lists of a chunk."""
         if chunk not in self._lists:
-            self._lists[chunk] = lists_into(self.network, chunk)
+            self._lists[chunk] = self._first_of_longest(chunk) or lists_into(self.network, chunk)
         return self._lists[chunk]
+
+    def look_ahead(self, longest: Chunk) -> None:
+        """Chunks that begin as this one and are shorter are asked about next."""
+        self._longest = longest, lists_into(self.network, longest)
+
+    def _first_of_longest(self, chunk: Chunk) -> tuple[Lists, ...]:
+        """Synapse lists of a chunk, if it is the beginning of the one that was looked ahead to."""
+        if self._longest is None:
+            return ()
+        longest, lists = self._longest
+        if (chunk.population, chunk.first) != (
+            longest.population,
+            longest.first,
+        ) or chunk.size > longest.size:
+            return ()
+        return tuple(lists_of_first(each, chunk.size) for each in lists)
 
     def drop(self, chunk: Chunk) -> None:
         """Forget the lists of a chunk that was only tried."""
@@ -148,6 +185,11 @@ class Needs:
             self._stored[key] = words, frozenset(formats)
         return self._stored[key]
 
+    def added(self, chunk: Chunk) -> tuple[int, int, int]:
+        """What a chunk adds to the limits in ``ADDED``, whatever else its core holds."""
+        out_axons = self.out_axons[chunk.population][chunk.first : chunk.last]
+        return chunk.size, sum(len(lists.source) for lists in self.lists(chunk)), int(out_axons.sum())
+
     def uses(self, chunks: Core, *, lean: bool = False, unrolled: bool = False) -> dict[str, int]:
         """Use of each limit by a core that holds these chunks in this order."""
         base = words = 0
@@ -162,10 +204,9 @@ class Needs:
             population = self.network.populations[chunk.population]
             thresholds |= set(np.unique(population.threshold[chunk.first : chunk.last]).tolist())
             decays.add((population.decay_u, population.decay_v))
+        added = zip(*map(self.added, chunks), strict=True)
         return {
-            "core.compartments": base,
-            "core.axons_in": sum(len(lists.source) for chunk in chunks for lists in self.lists(chunk)),
-            "core.axons_out": int(sum(self.out_axons[c.population][c.first : c.last].sum() for c in chunks)),
+            **dict(zip(ADDED, map(sum, added), strict=True)),
             "core.synapse_words": words,
             "core.threshold_slots": len(thresholds),
             "core.synapse_formats": len(formats),

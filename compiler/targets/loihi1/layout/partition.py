@@ -17,7 +17,7 @@ import numpy as np
 from spikeloom.compiler.errors import CapacityError, OptionError, Violation
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
-from spikeloom.compiler.targets.loihi1.layout.core_needs import Chunk, Core, Cores, Needs
+from spikeloom.compiler.targets.loihi1.layout.core_needs import ADDED, Chunk, Core, Cores, Needs
 from spikeloom.compiler.targets.loihi1.layout.place import core_traffic
 from spikeloom.compiler.targets.loihi1.legalize import violation
 from spikeloom.compiler.types import FloatArray
@@ -68,6 +68,7 @@ def _fill(needs: Needs, population: int) -> list[Chunk]:
         # memory (more of them may be alike); there a smaller chunk than the largest may come out, which fits
         # as well.
         ends = range(first + 1, min(size, first + needs.target.limit("core.compartments")) + 1)
+        needs.look_ahead(Chunk(population=population, first=first, last=ends.stop - 1))
         fitting = bisect_left(ends, True, key=exceeds)
         if not fitting:
             raise CapacityError(_worst(needs, population))
@@ -127,13 +128,16 @@ def _pack(needs: Needs, chunks: list[Chunk], rates: tuple[FloatArray, ...] | Non
 
     if len(chunks) > EXACT_CHUNKS:
         cores: list[Core] = []
+        allowed = [needs.target.limit(rule) for rule in ADDED]
+        used = np.zeros((len(chunks), len(ADDED)), np.int64)  # by core
         for chunk in sorted(chunks, key=lambda c: (-needs.stored(c, 0, unrolled=True)[0], c)):
-            for i, core in enumerate(cores):
-                if fits((*core, chunk)):
-                    cores[i] = (*core, chunk)
-                    break
-            else:
-                cores.append((chunk,))
+            more = needs.added(chunk)
+            roomy = np.flatnonzero(np.all(used[: len(cores)] + more <= allowed, axis=1)).tolist()
+            place = next((i for i in roomy if fits((*cores[i], chunk))), len(cores))
+            if place == len(cores):
+                cores.append(())
+            cores[place] = (*cores[place], chunk)
+            used[place] += more
         return cores
 
     alone: list[Core] = [(chunk,) for chunk in chunks]
