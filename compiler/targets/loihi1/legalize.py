@@ -176,9 +176,10 @@ def _faults(netlist: Netlist, target: Target) -> Iterator[Violation]:
             name = f"{target.name}.{rule}"
             words = ", ".join(map(str, allowed))
             yield Violation(owner="synapse formats", rule=name, used=str(value), allowed=words, remedy=again)
-    form = netlist.axon_format[netlist.axon_of_synapse()]
-    step = 1 << WEIGHT_BITS - netlist.format_weight_bits[form]
-    index = netlist.format_index_bits[form]
+    form = np.repeat(netlist.axon_format.astype(np.int32), np.diff(netlist.axon_synapses))
+    # narrow, for there may be millions of synapses
+    step = (1 << WEIGHT_BITS - netlist.format_weight_bits).astype(np.int16)[form]
+    index = netlist.format_index_bits.astype(np.int8)[form]
     wide = netlist.synapse_weight % step != 0
     far = (index > 0) & (netlist.synapse_target >> index > 0)
     for rule, broken, values in (
