@@ -78,8 +78,8 @@ class Recordings:
 
     def __repr__(self) -> str:
         """One line instead of the arrays."""
-        held = f"{number(len(self), 'recording')}, {number(self.taxels, 'taxel')}"
-        return f"{self.source}, {self.split}: {held}, up to {number(self.steps, 'step')}"
+        size = f"{number(len(self), 'recording')}, {number(self.taxels, 'taxel')}"
+        return f"{self.source}, {self.split}: {size}, up to {number(self.steps, 'step')}"
 
     def __len__(self) -> int:
         """Return the number of recordings."""

@@ -113,13 +113,7 @@ class Work:
         if works and until is not None and time.monotonic() >= until:
             works, until = [each for each in works if each.label == works[0].label], self.until()
         found = sweep(
-            works,
-            work.measure,
-            self.store,
-            jobs=self.jobs,
-            label=label,
-            kind=Measured,
-            until=until,
+            works, work.measure, self.store, jobs=self.jobs, label=label, kind=Measured, until=until
         )
         for key, each in found.items():
             if not each.suits(self.recordings):
