@@ -132,7 +132,7 @@ def class_in(where: str, name: str, found: FloatArray | Sequence[str]) -> str | 
     words = list(dict.fromkeys(each if isinstance(each, str) else f"{each:g}" for each in found))
     if len(words) > 1:
         raise DataError(
-            f"{where}: labels {plain(words[0])} and {plain(words[1])} in one file, allowed is one; "
+            f"{where}: labels {plain(words[0][:60])} and {plain(words[1][:60])} in one file, allowed is one; "
             "write one file for each recording"
         )
     label = class_of(words[0])
