@@ -52,8 +52,8 @@ def plain(text):
 
 def load(path):
     """Manifest and whole numbers of a file; nothing in it is executed."""
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
+    with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:
+        arrays = {name: content[name] for name in content.files}
     about = json.loads(str(arrays.pop("manifest")))
     return about, {name: each.astype(np.int64) for name, each in arrays.items() if each.dtype.kind == "i"}
 

@@ -217,7 +217,7 @@ def test_a_result_is_stale_when_what_its_command_read_does_something_else(stored
         states.append(stored.state("x.json"))
     stored.digest.cache_clear()
     assert states == ["up to date", "stale (code.py)", "stale (code.py, prices.toml)"]
-    assert stored.state("fuzz.json") == "not known"
+    assert stored.state("fuzz.json") == "finished"  # No script of it is in this folder
 
 
 def test_the_list_has_every_result(stored, capsys, monkeypatch):
