@@ -52,7 +52,7 @@ def plain(text):
 
 def load(path):
     """Manifest and whole numbers of a file; nothing in it is executed."""
-    with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:
+    with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as content:
         arrays = {name: content[name] for name in content.files}
     about = json.loads(str(arrays.pop("manifest")))
     return about, {name: each.astype(np.int64) for name, each in arrays.items() if each.dtype.kind == "i"}
