@@ -125,7 +125,7 @@ def compile(
         If something cannot be used, or the network does not fit; the message says what to do.
     """
     given = dict(locals())
-    source = _network("compile", network, example, polarities, polarities_first)
+    source = _network("compile", given)
     if storage is not None:
         from spikeloom.runtime.inputs.compilation import options_of
 
@@ -205,9 +205,7 @@ def finetune(
     given = dict(locals())
     from spikeloom.runtime.commands.training import finetune as command
 
-    given |= _place(data, bin) | {
-        "checkpoint": _network("finetune", network, example, polarities, polarities_first)
-    }
+    given |= _place(data, bin) | {"checkpoint": _network("finetune", given)}
     request = checked(FinetuneRequest, given)
     tuned: Finetuned = command.run(request).result
     if tuned.netlist is None:
@@ -366,14 +364,13 @@ def _place(data: Source, bin: float | None) -> dict[str, object]:
     return {"data": data, "bin": bin}
 
 
-def _network(
-    what: str,
-    network: str | os.PathLike[str] | nn.Module | Network,
-    example: Tensor | None,
-    polarities: int | None,
-    polarities_first: bool | None,
-) -> str | Network:
+OF_FILES = ("weights", "beta", "theta", "dt", "convention")
+"""Keywords about what a file does not say."""
+
+
+def _network(what: str, given: Mapping[str, Any]) -> str | Network:
     """File of a network, or what a module means."""
+    network, example = given["network"], given["example"]
     if isinstance(network, str | os.PathLike):
         return os.fspath(network)
     from torch import Tensor
@@ -387,4 +384,8 @@ def _network(
         raise OptionError(
             f"{what}: a module needs the input of one step; give example=torch.zeros(1, CHANNELS)"
         )
+    for name in OF_FILES:
+        if given.get(name) is not None:
+            raise OptionError(f"{what}: {name} is for files, and a module says it itself; leave it out")
+    polarities, polarities_first = given["polarities"], given["polarities_first"]
     return module_network(network, example, polarities=polarities, polarities_first=polarities_first)

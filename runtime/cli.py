@@ -77,7 +77,7 @@ class Parser(argparse.ArgumentParser):
             if any(word.startswith("--config") for word in args):
                 from spikeloom.runtime.commands.config import with_config
 
-                args = with_config(self, args)
+                args = with_config(self, args, COMMANDS)
             known = list(self._option_string_actions)
             places = {action.dest: action.metavar for action in self._actions if not action.option_strings}
             for word in args:

@@ -328,8 +328,12 @@ class Compiled:
         Its ``decision`` ends the grasp, and is that of :meth:`run`; the votes of a step are not final.
         """
         from spikeloom.runtime.machines.backends import machine_for
+        from spikeloom.runtime.report.console import tell
 
-        return machine_for(self.path).stream()
+        machine = machine_for(self.path)
+        if (bins := machine.netlist.bins) > 1:
+            tell(f"warning: {self.path.name}: a step is {bins} bins joined; hand in what of them is set")
+        return machine.stream()
 
     def _question(self, kind: type[Request], given: Mapping[str, Any]) -> Any:
         """The request of a method from its keywords."""

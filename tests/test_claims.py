@@ -10,8 +10,18 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-DRAWN = {"growth", "skins", "fuzz", "public", "convolutions", "silicon-predictions"}
-"""Results of made recordings or damages."""
+DRAWN = {
+    "certified",
+    "convolutions",
+    "fuzz",
+    "growth",
+    "interrupts",
+    "public",
+    "silicon-predictions",
+    "skins",
+    "soundness",
+}
+"""Results of made recordings, damages and other results."""
 
 
 @pytest.fixture(scope="module")

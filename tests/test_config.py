@@ -19,6 +19,7 @@ checkpoint = "net.pt"
 weight-bits = [4, 8, 8, 8]
 directed = true
 spike-exact = false
+keep-all = true
 chips = 2
 beta = 0.25
 polarities-first = true
@@ -32,6 +33,7 @@ jobs = 3
         "--weight-bits",
         "4,8,8,8",
         "--directed",
+        "--keep-all",
         "--chips",
         "2",
         "--beta",
@@ -42,6 +44,8 @@ jobs = 3
     assert request_of("compile", "--config", str(path)) == request_of("compile", "net.pt", *typed)
     wins = request_of("compile", f"--config={path}", "--dump-after", "prune", "-o", "b.loom", "--chip", "1")
     assert (wins.dump_after, wins.output, wins.chips, wins.beta) == (("prune",), "b.loom", 1, 0.25)
+    # --keep is no short form of --keep-all, as it is an option of its own
+    assert request_of("compile", "--config", str(path), "--keep", "0.5").keep_all
     assert request_of("chart", "n.pt", "--data", "d", "-o", "f", "--config", str(path)).jobs == 3
 
 
@@ -70,6 +74,7 @@ def test_a_written_file_gives_the_same_request(tmp_path, words):
         ("[run]\nsplitt = 'train'", "splitt: no option of run; see spikeloom run --help"),
         ("[run]\nconfig = 'y.toml'", "config: no option of run"),
         ("limit = 3", "limit is in no table; write [run] above it"),
+        ("[runn]\nlimit = 3", "[runn] is the table of no command; write [run]"),
         ("[run", "is truncated or damaged"),
         ("[run]\nlimit = 'three'", "argument --limit: invalid int value: 'three'"),
         ("[run]\nlimit = true", "limit = True: allowed: a value"),

@@ -152,7 +152,30 @@ def twice():
     return nn.Sequential(nn.Linear(4, 4), neurons, nn.Linear(4, 4), neurons)
 
 
+class Subtracting(LIF):
+    """Its membrane keeps what exceeds the threshold."""
+
+    def forward(self, current):
+        spikes = super().forward(current)
+        self.membrane = self.membrane - spikes * self.theta
+        return spikes
+
+
+class Recurrent(nn.Module):
+    """Its current adds the spikes of the step before."""
+
+    def __init__(self):
+        super().__init__()
+        self.linear, self.back, self.lif = nn.Linear(4, 3), nn.Linear(3, 3), LIF(0.5, 0.3)
+
+    def forward(self, x):
+        current = self.linear(x)
+        return self.lif(current if self.lif.spikes is None else current + self.back(self.lif.spikes))
+
+
 REFUSED = {
+    "module 1: has a forward of its own": lambda: nn.Sequential(nn.Linear(4, 2), Subtracting()),
+    "module: the stage before lif is not affine": Recurrent,
     "module: the stage before 3 is not affine (a random combination": lambda: nn.Sequential(
         nn.Linear(4, 3), LIF(), nn.Sequential(nn.Linear(3, 2), nn.ReLU()), LIF()
     ),

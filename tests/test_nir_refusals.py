@@ -81,6 +81,12 @@ def subtracting():
     return two_layers(last=neuron)
 
 
+def subtracting_as_a_whole():
+    graph = two_layers()
+    graph.metadata = {"reset_mechanism": "subtract"}
+    return graph
+
+
 def leaky(size, tau):
     return nir.LI(tau=np.full(size, tau), r=np.ones(size), v_leak=np.zeros(size))
 
@@ -132,6 +138,7 @@ GRAPHS = [
         lambda: two_layers(lif(3, tau=np.array([0.1, 0.2, 0.3]))),
     ),
     ("resets by subtraction (reset_mechanism = 'subtract')", subtracting),
+    ("the graph resets by subtraction", subtracting_as_a_whole),
     ("gets weighted spikes of n1", lambda: chain(affine(RNG, 5, 4), lif(5), affine(RNG, 3, 5))),
     ("has no spiking neurons", lambda: chain(affine(RNG, 5, 4))),
     (

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from commands import as_json, refusal, run
 from numpy.testing import assert_array_equal
+from oracles import refused
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.models.recordings.grasps import synthetic_split
@@ -65,6 +66,10 @@ POOL = (
 
 def budgets(*words):
     return parse_budgets(words, study.LIMITS)
+
+
+def test_a_share_is_no_per_cent():
+    refused(OptionError, "--budget accuracy=0.9: allowed is more than 1, up to 100", budgets, "accuracy=0.9")
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """The training loop: the released protocol, repeatable to the byte; fine-tuning on the integers of the chip."""
 
+import json
 from dataclasses import replace
 
 import made_files
@@ -129,6 +130,12 @@ def test_another_decay_is_an_option_that_a_state_remembers(tmp_path):
     refused(
         OptionError, "belongs to a training with other recipe; ", train, one, one, ADJACENCY, tiny, **options
     )
+
+
+def test_a_recipe_is_equal_to_what_its_file_says():
+    recipe = replace(RELEASED, hidden=(16,), betas=(("fc1", 0.5),), penalty=0.1)
+    assert json.loads(json.dumps(recipe.to_json())) == recipe.to_json()
+    assert "hidden" not in RELEASED.to_json()
 
 
 def test_best_weights_are_those_of_the_first_epoch_with_the_most_right(monkeypatch):

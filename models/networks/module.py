@@ -41,6 +41,11 @@ class _Stages:
         self.forced: list[Tensor] = []
         for module in self.net.modules():
             if isinstance(module, LIF):
+                if type(module).forward is not LIF.forward:
+                    raise ModelError(
+                        f"module {names[id(module)] or type(module).__name__}: has a forward of its own, so its "
+                        "neurons may be others than the chip's; use spikeloom.LIF as it is"
+                    )
                 module.register_forward_hook(self._record)
         first = example.detach().double()
         self.batched = first.dim() > 1 and self._is_batch(first)
@@ -81,12 +86,16 @@ class _Stages:
             return False
         return all(response.shape[:1] == (1,) for response in responses)
 
-    def respond(self, sources: list[Tensor]) -> list[Tensor]:
-        """Currents of each layer and then the output, for the input and, if they are given, spikes of each layer."""
+    def respond(self, sources: list[Tensor], *, at_rest: bool = True) -> list[Tensor]:
+        """Currents of each layer and then the output, for the input and, if they are given, spikes of each layer.
+
+        Neurons are `at_rest` before it, or as the step before left them.
+        """
         self.order = []
         self.currents = []
         self.forced = sources[1:]
-        reset(self.net)
+        if at_rest:
+            reset(self.net)
         output = self.net(sources[0])
         if not isinstance(output, Tensor):
             raise ModelError(
@@ -117,23 +126,27 @@ def _weights(stages: _Stages) -> tuple[list[list[Sparse]], list[FloatArray]]:
 
 
 def _require_affine(stages: _Stages, weights: list[list[Sparse]], biases: list[FloatArray]) -> None:
-    """Random combinations of all sources, small and large, must give the same combinations of the weights."""
+    """Random combinations of all sources, small and large, must give the same combinations of the weights.
+
+    They are one step after the other, so a stage that looks at an earlier step is found, too.
+    """
     rng = np.random.default_rng(0)
     named = [f"the stage before {name}" for name in stages.names] + ["the output"]
     for size in 10.0 ** np.arange(-2, 6):
         given = [rng.normal(size=shape) * size for shape in stages.shapes]
-        responses = stages.respond([torch.from_numpy(values) for values in given])
+        responses = stages.respond([torch.from_numpy(values) for values in given], at_rest=False)
         for what, response, parts, bias in zip(named, responses, weights, biases, strict=True):
             expected = sum(
                 (part @ values.ravel() for part, values in zip(parts, given, strict=True)), start=bias
             )
-            off = np.abs(response.numpy().ravel() - expected).max(initial=0) / max(
+            off = np.abs(response.detach().numpy().ravel() - expected).max(initial=0) / max(
                 np.abs(expected).max(initial=0), 1e-300
             )
             if not off <= AFFINE_TOLERANCE:
                 raise ModelError(
                     f"module: {what} is not affine (a random combination of inputs is off by {off:.2g} of the "
-                    f"response, {AFFINE_TOLERANCE:g} allowed); only affine stages between LIF layers become synapses"
+                    f"response, {AFFINE_TOLERANCE:g} allowed); only stages that are affine in what comes in this step "
+                    "become synapses"
                 )
 
 

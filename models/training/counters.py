@@ -74,7 +74,7 @@ class Plan:
 
     def require_possible(self) -> None:
         """Refuse numbers that no network has."""
-        require_least({"levels": self.levels}, levels=1)
+        require_least({"levels": self.levels, "ramp": self.ramp}, levels=1, ramp=1)
         if not 1 <= self.parts <= MOST_CLOCKS:
             raise OptionError(f"--parts {self.parts}: allowed are 1 to {MOST_CLOCKS}; choose another")
         if not 1 <= self.window <= WHOLE:

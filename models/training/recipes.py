@@ -70,8 +70,12 @@ class Recipe:
 
     def to_json(self) -> JsonObject:
         """JSON values that are not the defaults; a training states its number of epochs by itself."""
-        values = asdict(self) | {"betas": dict(self.betas), "alphas": dict(self.alphas)}
-        defaults = {"epochs": self.epochs, "hidden": HIDDEN, "penalty": 0, "robust": 0}
+        values = asdict(self) | {
+            "betas": dict(self.betas),
+            "alphas": dict(self.alphas),
+            "hidden": list(self.hidden),
+        }
+        defaults = {"epochs": self.epochs, "hidden": list(HIDDEN), "penalty": 0, "robust": 0}
         return {
             name: value for name, value in values.items() if name not in defaults or value != defaults[name]
         }

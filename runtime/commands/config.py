@@ -6,7 +6,7 @@
 import argparse
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,9 @@ SIZE_LIMIT = 2**20
 """Bytes of such a file."""
 
 
-def with_config(parser: argparse.ArgumentParser, words: Sequence[str]) -> list[str]:
+def with_config(
+    parser: argparse.ArgumentParser, words: Sequence[str], commands: Collection[str]
+) -> list[str]:
     """Words of a command line with those of its ``--config`` in front, as far as they are not typed.
 
     OptionError for a file that cannot be read, and for keys and tables that nothing has.
@@ -34,23 +36,26 @@ def with_config(parser: argparse.ArgumentParser, words: Sequence[str]) -> list[s
     command = parser.prog.removeprefix("spikeloom ")
     more: list[str] = []
     places: list[str] = []
-    for key, value in _table(path, command).items():
+    whole = {flag for each in parser._actions for flag in each.option_strings}
+    for key, value in _table(path, command, commands).items():
         action = _action(parser, key)
         if action is None or key in (READ[2:], WRITE[2:]):
             raise OptionError(f"{path}: {key}: no option of {command}; see {parser.prog} --help")
         if not action.option_strings:
             places += _texts(path, key, value)
-        elif not _is_typed(action, typed):
+        elif not _is_typed(action, typed, whole):
             more += _typed(path, key, value, action)
     return [*places, *more, *typed]
 
 
-def _table(path: str, command: str) -> Mapping[str, Any]:
+def _table(path: str, command: str, commands: Collection[str]) -> Mapping[str, Any]:
     """The table of a command, which may be missing."""
     with reading(path, OptionError, "give a TOML file with a table [COMMAND]"):
         tables = tomllib.loads(read_whole(Path(path), "file of options", SIZE_LIMIT).decode())
         if stray := [name for name, table in tables.items() if not isinstance(table, dict)]:
             raise FileFault(f"{stray[0]} is in no table; write [{command}] above it")
+        if unknown := [name for name in tables if name.split(" ")[0] not in commands]:
+            raise FileFault(f"[{unknown[0]}] is the table of no command; write [{command}]")
     table: Mapping[str, Any] = tables.get(command, {})
     return table
 
@@ -68,11 +73,11 @@ def _action(parser: argparse.ArgumentParser, key: str) -> argparse.Action | None
     )
 
 
-def _is_typed(action: argparse.Action, typed: Sequence[str]) -> bool:
+def _is_typed(action: argparse.Action, typed: Sequence[str], whole: Collection[str]) -> bool:
     """Whether it is on the command line, shortened too."""
     names = [word.partition("=")[0] for word in typed if word.startswith("-")]
     return any(
-        flag == name or (len(name) > 2 and flag.startswith(name))
+        flag == name or (len(name) > 2 and name not in whole and flag.startswith(name))
         for flag in action.option_strings
         for name in names
     )

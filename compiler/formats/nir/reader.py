@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -95,6 +96,7 @@ def network_of(
             f"has the shape {list(shape[:AXES])}, allowed are up to {ELEMENTS} values; export it again"
         )
     sensor, positions, words = _sensor(graph, shape, polarities, polarities_first)
+    _require_reset(graph.metadata, lambda words: ModelError(f"the graph {words}"))
     spiking, result = _walk(graph, steps, shape)
     if not spiking:
         raise ModelError("has no spiking neurons, so nothing can be counted; export a spiking network")
@@ -314,7 +316,7 @@ def _neurons(node: Node, value: stages.Value, steps: stages.Steps) -> Neurons:
     shape = value.shape
     if not size:
         raise node.fail("has no neurons; export it again")
-    _require_reset(node)
+    _require_reset(node.metadata | {k: v for k, v in node.values.items() if "reset" in k}, node.fail)
 
     def each(key: str) -> FloatArray:
         return stages.spread(node, key, size, shape)
@@ -349,10 +351,11 @@ def _neurons(node: Node, value: stages.Value, steps: stages.Steps) -> Neurons:
     return Neurons(node=node, value=state, beta=beta, gain=gain, theta=theta, reset=reset)
 
 
-def _require_reset(node: Node) -> None:
-    for key, value in (node.metadata | {k: v for k, v in node.values.items() if "reset" in k}).items():
+def _require_reset(said: Mapping[str, Any], fail: Callable[[str], Exception]) -> None:
+    """Refuse what a node or the graph says of a reset that the chip does not have."""
+    for key, value in said.items():
         if "reset" in key.lower() and isinstance(value, str) and any(word in value.lower() for word in SOFT):
-            raise node.fail(
+            raise fail(
                 f"resets by subtraction ({key} = {value!r}), which a neuron of this chip cannot; train with a reset "
                 "to a value"
             )
