@@ -104,7 +104,8 @@ def reading(where: object, error: type[SpikeloomError], remedy: str) -> Iterator
             said = str(found)
         elif isinstance(found, OSError) and found.strerror:
             said = f"cannot be read ({found.strerror}); check its permissions"
-        raise kind(f"{where}: {_shortened(said, MOST_SAID - 2 - len(Path(str(where)).name))}") from found
+        named = re.sub(r"^\S*/", "", str(where))  # with the member of an archive
+        raise kind(f"{where}: {_shortened(said, MOST_SAID - 2 - len(named))}") from found
 
 
 def _shortened(said: str, room: int) -> str:
