@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from spikeloom.compiler import __version__
-from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.base import Target
 from spikeloom.runtime.studies.chart import work
 from spikeloom.runtime.studies.chart.grid import Grid
@@ -82,6 +82,10 @@ def chart(
                 refused.append(Refused(**axes, why=built.refused))
                 continue
             for window in grid.window:
+                if {"train", "test"} - built.figures.get(window, {}).keys():
+                    raise DataError(
+                        f"{folder / STORE}: its figures of {each.key} lack a split; give another -o"
+                    )
                 points.append(_point(len(points) + 1, axes, each, built, window))
     if not points:
         why = f"refuses all {len(refused)} configurations; the first: {refused[0].why[0]}"
