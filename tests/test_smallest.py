@@ -69,7 +69,7 @@ def budgets(*words):
 
 
 def test_a_share_is_no_per_cent():
-    refused(OptionError, "--budget accuracy=0.9: allowed is more than 1, up to 100", budgets, "accuracy=0.9")
+    refused(OptionError, "--budget accuracy=0.9: allowed is 1 to 100 per cent", budgets, "accuracy=0.9")
 
 
 @pytest.fixture

@@ -63,9 +63,8 @@ def parse_budgets(
                 + (f" ({names})" if names else "")
             )
         limit = float(f"{number[1]}e{number[2] or 0}") * unit
-        least = 0.01 if units is _SHARE else 0.0  # 0.9 is meant as a share, not as 0.9 %
-        if limit <= least or (units is _SHARE and limit > 1):
-            allowed = "more than 1, up to 100 per cent" if units is _SHARE else "more than 0"
+        if limit <= 0 or (units is _SHARE and not 0.01 <= limit <= 1):  # 0.9 is meant as a share
+            allowed = "1 to 100 per cent" if units is _SHARE else "more than 0"
             raise OptionError(f"--budget {words}: allowed is {allowed}")
         budgets[what] = Budget(what=what, limit=limit, words=words)
     return tuple(budgets.values())
