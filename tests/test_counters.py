@@ -178,6 +178,7 @@ def test_inconsistent_and_damaged_files_are_refused(tmp_path, change, said):
         (Plan(thresholds=(4, 4)), "--thresholds 4,4"),
         (Plan(thresholds=(0,)), "--thresholds 0"),
         (Plan(parts=0), "--parts 0"),
+        (Plan(ramp=0), "--ramp 0"),
         (Plan(parts=41), "--parts 41: a recording has 40 steps"),
     ],
 )

@@ -8,7 +8,8 @@ from made_modules import CLASSES, NETS, TAXELS, AllSteps, OneStep, example_of, m
 from oracles import refused
 from torch import nn
 
-from spikeloom.compiler.errors import ModelError
+import spikeloom
+from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.networks.lif import LIF, reset
@@ -192,6 +193,17 @@ REFUSED = {
         nn.Linear(4, 2), LIF(theta=0)
     ),
 }
+
+
+def test_what_a_module_says_itself_is_not_given_beside_it():
+    refused(
+        OptionError,
+        "compile: beta is for files, and a module says it itself",
+        spikeloom.compile,
+        seeded(mlp),
+        example=torch.zeros(1, 12),
+        beta=0.9,
+    )
 
 
 @pytest.mark.parametrize("words", REFUSED)
