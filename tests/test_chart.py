@@ -273,6 +273,30 @@ def test_the_point_that_fits_all_budgets(points, budgets, number, fitting):
     )
 
 
+def test_a_budget_of_decisions_that_no_event_alters(points):
+    shares = (0.5, 0.9, None, 0.8, 0.95)
+    points = [
+        replace(each, train=replace(each.train, certified=certified))
+        for each, certified in zip(points, shares, strict=True)
+    ]
+    found = study.pick(points, parse_budgets(["certified=80"]), BY)
+    assert (found.fits, found.fitting, found.point) == (True, 3, 2)
+
+
+def test_a_chart_that_certifies_measures_what_certify_finds(place, as_json):
+    words = ("chart", "ring.pt", "--data", "data", "--jobs", "1", "--grid", "bits=8,window=50-100%:50")
+    plain = as_json(*words, "-o", "certifies")["points"]
+    found = as_json(*words, "--budget", "certified=1", "-o", "certifies", codes=(0, 1))["points"]
+    shares = [each["train"].pop("certified") for each in found]
+    assert found == plain
+    assert all("certified" not in each["test"] for each in found)
+    netlist = str(place / "certifies" / found[1]["netlist"])
+    told = as_json("certify", netlist, "--data", "data", "--split", "train", "--most", "1")["certificates"]
+    stand = [each["at_least"] >= 1 for each in told]
+    assert shares[1] == sum(stand) / len(stand)
+    assert len(set(shares)) == 2
+
+
 @pytest.mark.parametrize(
     ("budgets", "number"), [(["energy=20uJ"], 4), (["energy=50uJ", "time=2ms"], 3), (["accuracy=95"], 1)]
 )

@@ -59,7 +59,8 @@ class ChartRequest(ClusterChoice, CheckpointChoice, ShownConditionChoice, DataCh
         metavar="AXIS=V,V,…",
     )
     budget: tuple[str, ...] = option(
-        "limit for the point to deploy: energy=0.1mJ, time=5ms or accuracy=88; may be repeated, all must hold",
+        "limit for the point to deploy: energy=0.1mJ, time=5ms, accuracy=88 or certified=90; may be repeated, all must "
+        "hold",
         default=(),
         metavar="WHAT=LIMIT",
     )

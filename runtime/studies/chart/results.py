@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from spikeloom.runtime.report.encode import INLINE, key
+from spikeloom.runtime.report.encode import INLINE, OPTIONAL, key
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.studies.chart.grid import FEWEST, Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
@@ -26,6 +26,9 @@ class Figures(Share):
     costs: Costs = field(metadata=INLINE)
     steps: float
     conditions: Mapping[str, Share] = field(default_factory=dict)  # Accuracy in each condition
+    certified: float | None = field(
+        default=None, metadata=OPTIONAL
+    )  # Share of some training decisions that no event alters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

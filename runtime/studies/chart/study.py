@@ -65,8 +65,9 @@ def chart(
 
     `command` repeats it; an OptionError says that the chip refuses all configurations.
     """
+    certify = any(budget.what == "certified" for budget in budgets)
     works = [
-        work.measurement(network, storage, grid, data, target, folder, groups)
+        work.measurement(network, storage, grid, data, target, folder, groups, certify=certify)
         for network in networks
         for storage in network.storages(grid)
     ]
@@ -162,7 +163,7 @@ def above_on_test(chart: Chart) -> list[Point]:
 
 def _values(point: Point, by: ChosenBy) -> dict[str, float]:
     """What budgets limit, on the training split."""
-    return by.of(point.train.costs) | {"accuracy": point.expected}
+    return by.of(point.train.costs) | {"accuracy": point.expected, "certified": point.train.certified or 0.0}
 
 
 def _less_accurate(best: Point, other: Point) -> bool:

@@ -5,7 +5,7 @@ the command ``compile`` would write. A network is rounded once for any number of
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import CapacityError, ModelError
 from spikeloom.compiler.interpret import vote
+from spikeloom.compiler.passes.calibrate import evenly_spaced
 from spikeloom.compiler.targets.base import Target, load_target
 from spikeloom.compiler.targets.compartments import (
     Compilation,
@@ -41,8 +42,12 @@ from spikeloom.runtime.studies.chart.grid import FEWEST, Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
 from spikeloom.runtime.studies.chart.results import FORMAT, SPLITS, Figures
 from spikeloom.runtime.studies.jobs import Job, content_key
+from spikeloom.runtime.studies.robustness.exhaustive import share_robust_to_one_event
 from spikeloom.runtime.studies.search.measure import measure as measure_costs
 from spikeloom.runtime.studies.search.results import Data, Share, share
+
+CERTIFIED = 48
+"""Training recordings whose every single event is changed, evenly spaced."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +75,7 @@ class Measurement(Job):
     windows: tuple[int, ...]
     data: Data
     groups: Groups
+    certify: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +98,8 @@ def measurement(
     target: Target,
     folder: Path,
     groups: Groups,
+    *,
+    certify: bool,
 ) -> Measurement:
     """Work whose key, and the names of its netlists in a folder, are of everything that decides the result."""
 
@@ -101,8 +109,9 @@ def measurement(
         return content_key(shared | about)
 
     windows = tuple(sorted(grid.window))
+    known: dict[str, Any] = {"layouts": grid.cores, "windows": windows, "groups": groups.sha256}
     return Measurement(
-        key=keyed("figures", layouts=grid.cores, windows=windows, groups=groups.sha256),
+        key=keyed("figures", **known, **({"certified": True} if certify else {})),
         label=f"{network.name} {storage.label()}",
         network=network,
         storage=storage,
@@ -112,6 +121,7 @@ def measurement(
         windows=windows,
         data=data,
         groups=groups,
+        certify=certify,
     )
 
 
@@ -230,6 +240,11 @@ def _built(work: Measurement, stored: Compilation, layout: str) -> Built:
         }
         for window, each in _decided(work.network, work.data, work.groups, work.windows).items()
     }
+    if work.certify:
+        for window, each in figures.items():
+            rows = evenly_spaced(np.arange(len(splits["train"])), CERTIFIED)
+            some = first_part(splits["train"].part(rows), window)
+            each["train"] = replace(each["train"], certified=share_robust_to_one_event(machine, some))
     return Built(
         sha256=sha256,
         cores=netlist.n_cores,

@@ -41,7 +41,7 @@ class Budget:
 
 
 def parse_budgets(
-    given: Sequence[str], limits: Collection[str] = ("energy", "time", "accuracy")
+    given: Sequence[str], limits: Collection[str] = ("energy", "time", "accuracy", "certified")
 ) -> tuple[Budget, ...]:
     """Read the words of every ``--budget``; an OptionError says which is none of what has `limits`."""
     budgets: dict[str, Budget] = {}
