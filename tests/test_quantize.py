@@ -82,7 +82,7 @@ def test_a_large_layer_gives_up_scale_for_the_proof():
 
 
 def test_a_small_layer_uses_the_full_range():
-    integer, (choice,) = choose_storage(nets.chain([[0.5, -0.25, 0.125]]), nets.LOIHI)
+    integer, (choice,) = choose_storage(nets.chain([[0.5, -0.251, 0.126]]), nets.LOIHI)
     assert integer.projections[0].weight.toarray().tolist() == [[254, -128, 64]]
     # the largest exponent that the positive sum of 318 allows: threshold and bias are finest there
     assert (choice.exponent, choice.scale, choice.clipped) == (6, 508 * 64, 0)

@@ -13,6 +13,7 @@ from spikeloom.compiler.targets.loihi1.remove import Removal
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import Choice
 from spikeloom.compiler.targets.loihi1.storage.ladder import Trial
 from spikeloom.compiler.targets.loihi1.storage.spike_exact import Exactness
+from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.machines.loihi1 import description
 from spikeloom.runtime.machines.loihi1.description import NetlistFacts
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
@@ -109,6 +110,13 @@ def _storage(facts: CompilationFacts) -> Iterator[Block]:
             yield Text(
                 f"{choice.layer}: {100 * choice.zeroed / choice.weights:.0f} % of its weights round to zero; "
                 "more --planes, --scale-groups or --weight-bits keep them"
+            )
+    for choice in facts.calibration:
+        if choice.ties:
+            remedy = "fewer --planes" if choice.planes > 1 else "more --weight-bits"
+            yield Text(
+                f"{choice.layer}: {number(choice.ties, 'neuron')} can get sums of exactly the threshold and, rounded, "
+                f"may decide these otherwise than the float model; {remedy} can keep them"
             )
 
 

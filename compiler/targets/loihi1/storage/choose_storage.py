@@ -41,6 +41,7 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     spike_cost,
     with_spike_errors,
 )
+from spikeloom.compiler.targets.loihi1.storage.ties import ties_moved, without_memory
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, loads
 from spikeloom.compiler.types import FloatArray
 
@@ -71,6 +72,7 @@ class Choice:
     candidates: int  # Scales that were compared
     flips: int | None  # Calibration spikes that differ from float64; None without calibration
     spikes: int | None  # Calibration spikes of the float64 model
+    ties: int  # Neurons whose sums can be exactly their threshold, and that decide this otherwise, see :mod:`ties`
     headroom: (
         float  # Share that the worst case leaves free of the register that it fills first, see ``Rounded``
     )
@@ -119,7 +121,7 @@ def best_scale(
     for factor in factors:
         stored, limited = candidate(layer, packing, factor, exponents)
         if stored is not None:
-            scales[stored.form.exponents, int(stored.form.threshold[0])] = stored
+            scales[stored.form.exponents, int(stored.form.threshold[0])] = without_memory(layer, stored)
         if limited:
             break
     candidates = list(scales.values())
@@ -227,6 +229,7 @@ def explain_choice(layer: FloatLayer, chosen: Rounded) -> Choice:
         candidates=chosen.tried,
         flips=None if layer.calibration is None else chosen.flips,
         spikes=None if layer.calibration is None else layer.calibration.spikes[layer.post].total,
+        ties=ties_moved(layer, chosen),
         headroom=1 - chosen.reached / ONE_STEP_SUM_MAX,
     )
 
@@ -263,8 +266,12 @@ def choose_storage(
         if calibration is not None and known is not None:
             if packing.planes > 1 and (best.compensated or not share_lists):
                 best = round_with_more(layer, best, calibration)
-            best = adjust_biases(layer, best, known)
+            best = with_spike_errors(
+                without_memory(layer, adjust_biases(layer, best, known)), layer.post, known
+            )
             known = known.after(integer_layer(best.population, best.projections))
+        else:
+            best = without_memory(layer, best)
         layers.append(layer)
         chosen.append(best)
     if faults:

@@ -189,12 +189,22 @@ def mantissa_scale(layer: Rounded) -> float:
     return float(layer.population.scale.min()) / 2.0 ** layer.form.exponents[0]
 
 
+def _unit(projections: Sequence[Projection]) -> float:
+    """Largest of 1, 1/2, … 1/64 of which all weights are multiples; 0 without one."""
+    finest = [p.weight.data * 64 for p in projections]
+    if not all(np.array_equal(each, np.rint(each)) for each in finest):
+        return 0.0
+    return next(
+        unit for unit in 2.0 ** -np.arange(7) if all(np.all(each % (64 * unit) == 0) for each in finest)
+    )
+
+
 def candidate(
     layer: FloatLayer, packing: Packing, factor: float, exponents: tuple[int, ...]
 ) -> tuple[Rounded | None, bool]:
     """Best compromise between a fine weight scale and a fine threshold, see ``WORTHWHILE``.
 
-    Weights that are whole numbers stay so, up to their scale. `factor` says how far the scale may exceed the
+    Weights that are multiples of 1, 1/2, … 1/64 stay so, up to their scale. `factor` says how far the scale may exceed the
     one that just holds the largest weight; the rest is clipped. Also whether registers, not that, limit the
     scale: a larger factor gives the same.
     """
@@ -203,13 +213,13 @@ def candidate(
     chosen = None
     limited = False
     finest = 0.0
-    whole = all(np.array_equal(p.weight.data, np.rint(p.weight.data)) for p in layer.projections)
-    worthwhile = 1.0 if whole else WORTHWHILE
+    unit = _unit(layer.projections)
+    worthwhile = 1.0 if unit else WORTHWHILE
     for exponent in sorted(exponents):
         stored = planes_from(exponent, bits, packing.planes, max(exponents))
         scale = reach(bits, stored) * weight_step(bits) / peak if peak else 1.0 / layer.population.theta
-        if whole and scale >= weight_step(bits):  # at a multiple of the step no weight is rounded
-            scale -= scale % weight_step(bits)
+        if unit and scale * unit >= weight_step(bits):  # at a multiple of the step no weight is rounded
+            scale -= scale % (weight_step(bits) / unit)
         fitted = fit(layer, bits, stored, scale * factor)
         if fitted is None and chosen is None:
             continue  # the threshold is less than a unit, a larger exponent makes it more

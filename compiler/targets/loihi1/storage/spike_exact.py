@@ -37,6 +37,7 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     layer_of,
     with_spike_errors,
 )
+from spikeloom.compiler.targets.loihi1.storage.ties import without_memory
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load
 from spikeloom.compiler.types import BoolArray
 
@@ -91,7 +92,7 @@ def make_exact(
         assert best is not None, "the ladder has steps"
         if best.flips:
             best = round_with_more(layer, best, calibration)
-        best = with_spike_errors(best, post, calibration)
+        best = with_spike_errors(without_memory(layer, best), post, calibration)
         layer = replace(layer, calibration=calibration)
         layers.append(layer)
         chosen.append(best)

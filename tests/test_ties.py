@@ -1,0 +1,63 @@
+"""Sums that are exactly the threshold: the chip decides them as the float model does, or ``compile`` says so."""
+
+import numpy as np
+import pytest
+import random_networks as nets
+from numpy.testing import assert_array_equal
+
+from spikeloom.compiler.interpret import run_float
+from spikeloom.compiler.storage import Fixed, Packing
+from spikeloom.compiler.targets.loihi1.integers import run_integer
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.options import Options
+from spikeloom.compiler.targets.loihi1.passes import compile_network
+from spikeloom.runtime.machines.loihi1 import compiled
+from spikeloom.runtime.report.sections import terminal
+
+WEIGHTS = (
+    [[1.0, 1.0, 1.0, 1.0], [2.0, 1.0, -1.0, 0.0]],
+    [[0.5, 0.25, -0.25, 0.5], [0.25, 0.25, 0.25, 0.25]],
+    [[1.0, 1.0, -5.0, -7.0], [3.0, 2.0, -1.0, -1.0]],
+)
+
+
+def events(steps=80):
+    return np.random.default_rng(0).random((60, steps, 4)) < 0.5
+
+
+@pytest.mark.parametrize("calibrated", [False, True], ids=["weights alone", "calibrated"])
+@pytest.mark.parametrize("theta", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("weight", WEIGHTS, ids=str)
+def test_a_layer_without_memory_fires_as_the_float_model_on_every_tie(weight, theta, calibrated):
+    network = nets.chain(weight, beta=0.0, theta=theta)
+    given = events()
+    sums = given.astype(float) @ np.array(weight).T
+    training = {"training_events": given.transpose(0, 2, 1)[:, :, None]} if calibrated else {}
+    done = compile_network(network, Options(storage=Fixed((Packing(),)), **training))
+    assert np.any(sums == theta) or theta != 1.0
+    assert not done.choices[0].ties
+    assert_array_equal(run_integer(lift(done.netlist), given).spikes[0], sums > theta)
+
+
+def test_real_weights_without_memory_fire_by_the_rounded_sums_alone():
+    rng = np.random.default_rng(1)
+    network = nets.chain(rng.normal(size=(6, 4)), beta=0.0, theta=0.8, biases=[rng.normal(size=6) * 0.1])
+    integer = lift(compile_network(network).netlist)
+    chip = integer.populations[0]
+    given = events()
+    sums = (given.astype(np.int64) @ integer.projections[0].effective().toarray().T) * 64 + chip.bias
+    fired = run_integer(integer, given).spikes[0]
+    assert_array_equal(fired, sums > chip.threshold * 64)
+    assert fired.any()
+
+
+def test_ties_that_a_storage_decides_otherwise_are_said():
+    network = nets.chain([[1.0, 2.0, -1.0]], beta=0.0, theta=2.0)
+    done = compile_network(network, Options(storage=Fixed((Packing(planes=3),))))
+    given = events()[..., :3]
+    assert not np.array_equal(
+        run_integer(lift(done.netlist), given).spikes[0], run_float(network, given).spikes[0]
+    )
+    outcome = compiled.outcome(done, "0" * 64)
+    said = " ".join(terminal(outcome.sections(outcome.result)).split())
+    assert "fc1: 1 neuron can get sums of exactly the threshold and, rounded, may decide" in said
