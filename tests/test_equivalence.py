@@ -185,7 +185,7 @@ def test_ill_posed_spikes_are_told_from_faults(tmp_path):
     assert found.spikes["fc1"].ill_posed == 0
     assert rungs(found)["float64"] == {"conv1": 0, "fc1": 0, "fc2": 6 * STEPS * 8, "fc3": 0}
     # a finer chip would have sided with float64; this one stands for it
-    finer = dataclasses.replace(netlist, threshold=read_only(netlist.threshold - (netlist.layer == 2)))
+    finer = dataclasses.replace(netlist, threshold=read_only(netlist.threshold - 8 * (netlist.layer == 2)))
     first = verify(finer, expand(checkpoint, adjacency), recorded(events(0))).first_divergence
     assert (first.layer, first.step, first.neuron, first.ill_posed) == ("fc2", 0, 0, True)
 

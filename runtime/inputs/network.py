@@ -114,10 +114,11 @@ def _read_nir(path: str, request: NetworkChoice, made: Mapping[str, Any]) -> Loa
 
     read = read_nir(
         path,
-        dt=made.get("dt") if request.dt is None else request.dt,
-        convention=made.get("convention") if request.convention is None else request.convention,
+        dt=request.dt,
+        convention=request.convention,
         polarities=request.polarities,
         polarities_first=request.polarities_first,
+        usual=made,
     )
     return _loaded("nir", read)
 

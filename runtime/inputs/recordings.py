@@ -1,6 +1,7 @@
 """Recordings that a user names, held against a network."""
 
 import hashlib
+import math
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
@@ -56,6 +57,7 @@ def recordings(
     wanted = None if groups is None else [name.strip() for name in groups.split(",")]
     if isinstance(path, Recordings):
         given = path if known is None else renamed(path, known)
+        _warn_of_steps(given, trained or {})
         require_suited(given, classes=classes, taxels=taxels)
         _require_width(given, trained_bin, f"read them with recordings(…, bin={trained_bin})")
         data = first_part(with_groups(_first(given, limit), wanted), (trained or {}).get("window", WHOLE))
@@ -92,6 +94,7 @@ def recordings(
         (data,) = without_gaps(data)
     data = first_part(data, (trained or {}).get("window", WHOLE))
     _warn_of_training(data, trained or {})
+    _warn_of_steps(data, trained or {})
     return events.joined_bins(data, bins)
 
 
@@ -148,6 +151,16 @@ def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int, 
         tell(f"warning: {data.source}: {origin}{advice}")
 
 
+def _warn_of_steps(data: Recordings, trained: Mapping[str, Any]) -> None:
+    """Say on stderr that bins are not the steps that a network was read in, where no training says which it needs."""
+    step = trained.get("step_s")
+    if step is not None and "bin_s" not in trained and not math.isclose(step, data.seconds, rel_tol=1e-6):
+        tell(
+            f"warning: {data.source}: bins of {data.seconds:g} s, the network was read in steps of {step:g} s; are "
+            "these its steps?"
+        )
+
+
 def _warn_of_training(data: Recordings, trained: Mapping[str, Any]) -> None:
     """Say on stderr that what stands for new recordings is what trained the network."""
     known = trained.get("train_sha256")
@@ -199,6 +212,11 @@ def require_bins(bins: int) -> None:
         raise OptionError(f"--join {bins}: allowed are 1 to {events.MAX_STEPS}; choose another")
 
 
+def step_of(read_as: Mapping[str, Any], bins: int) -> dict[str, float]:
+    """Seconds of a bin in the steps that a network was read in, where its file has such, as `recordings` takes them."""
+    return {"step_s": read_as["dt"] / bins} if "dt" in read_as else {}
+
+
 def load_recordings(
     source: str | Recordings,
     request: SplitChoice,
@@ -214,7 +232,7 @@ def load_recordings(
     """
     said = getattr(request, "window", None)
     window = WHOLE if said is None else parse_window(said)
-    trained = origin_of(netlist.provenance)
+    trained = origin_of(netlist.provenance) | step_of(netlist.provenance, netlist.bins)
     if said is not None:
         trained.pop("window", None)
     progress("reading the recordings")

@@ -59,19 +59,26 @@ def read_nir(
     convention: str | None = None,
     polarities: int | None = None,
     polarities_first: bool | None = None,
+    usual: Mapping[str, Any] | None = None,
 ) -> ReadNetwork[Network]:
     """Read a network, in steps of `dt` seconds, by default those that the metadata of the file tell.
 
     The `convention` (``euler`` by default) says how time constants become decays, see :mod:`nir.stages`;
-    polarities are those of :func:`sensor_layout.sensor_layout`.
+    polarities are those of :func:`sensor_layout.sensor_layout`. `usual` has both where neither is given, nor
+    stated by the file.
 
     Raises ModelError if the file cannot be read, or holds something else than a network that spikes,
-    feed-forward but for recurrent layers, naming the node; OptionError if there is no time step, or an
-    option has no such value.
+    feed-forward but for recurrent layers, naming the node; OptionError if there is no time step, an option
+    has no such value, or is another than the file states.
     """
     with reading(path, ModelError, AGAIN):
         graph = graph_of(*read_hdf5(Path(path), "NIR file"))
-        dt = stages.stated_step(graph) if dt is None else dt
+        stated = stages.stated_step(graph)
+        if stated is not None:
+            _require_stated(stated, dt, convention)
+            usual = {"dt": stated}
+        dt = (usual or {}).get("dt") if dt is None else dt
+        convention = (usual or {}).get("convention") if convention is None else convention
         if dt is None:
             written = stages.written_step(graph)
             hint = (
@@ -82,6 +89,16 @@ def read_nir(
         stages.require_step(dt)
         with np.errstate(all="ignore"):  # what is not finite is refused at the end
             return network_of(graph, steps, polarities, polarities_first)
+
+
+def _require_stated(stated: float, dt: float | None, convention: str | None) -> None:
+    """Refuse options that contradict the steps that a file states of itself."""
+    if dt is not None and dt != stated:
+        raise OptionError(f"--dt {dt:g}: the file states steps of {stated:g} s; omit --dt")
+    if convention not in (None, CONVENTIONS[0]):
+        raise OptionError(
+            f"--convention {convention}: the file states its steps, which are {CONVENTIONS[0]}; omit --convention"
+        )
 
 
 def network_of(
@@ -380,6 +397,11 @@ def _facts(
     facts += [
         "v goes to its reset as NIR says; a framework that subtracts the threshold instead means another network"
     ]
+    if moved := [printable(one.node.name) for one in spiking if np.any(one.reset)]:
+        facts.append(
+            f"{', '.join(moved)}: v starts at its reset, of which NIR says nothing; a framework that starts at another "
+            "v spikes otherwise until the first reset"
+        )
     if any(one.node.type == "CubaLIF" for one in spiking):
         facts += [
             "a reset leaves currents as they are, as NIR says; snnTorch's Synaptic with reset 'zero' clears them"

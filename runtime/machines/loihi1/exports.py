@@ -98,7 +98,9 @@ def _onnx(request: ExportRequest) -> Export:
 def _nir(request: ExportRequest) -> Export:
     netlist = _legal(request.source)
     origin = origin_of(netlist.provenance)
-    dt = origin.get("bin_s", BIN_S) * netlist.bins if request.dt is None else request.dt
+    read_in = netlist.provenance.get("dt", BIN_S * netlist.bins)
+    own = origin["bin_s"] * netlist.bins if "bin_s" in origin else read_in
+    dt = own if request.dt is None else request.dt
     facts = NirFacts(
         neurons=sum(layer.neurons for layer in netlist.layers),
         synapses=netlist.n_synapses,

@@ -20,7 +20,7 @@ from spikeloom.models.recordings.events import of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.compilation import parse_cores, provenance, storage_of
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
-from spikeloom.runtime.inputs.recordings import recordings
+from spikeloom.runtime.inputs.recordings import recordings, step_of
 from spikeloom.runtime.inputs.repeat import LAYOUT, NETWORK, ROUNDING, command, refuse, typed
 from spikeloom.runtime.machines.backend import Lowered
 from spikeloom.runtime.machines.base import Model
@@ -99,7 +99,7 @@ def _calibration(source: str | Recordings, bin_s: float | None, loaded: LoadedNe
         taxels=loaded.network.input.taxels,
         bin_s=bin_s,
         bins=loaded.network.input.bins,
-        trained=origin_of(loaded.training),
+        trained=origin_of(loaded.training) | step_of(loaded.read_as, loaded.network.input.bins),
     )
 
 

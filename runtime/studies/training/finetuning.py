@@ -29,7 +29,7 @@ from spikeloom.runtime.inputs.checkpoint import load_graph
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
-from spikeloom.runtime.inputs.recordings import recordings, require_splits, warn_of_shared
+from spikeloom.runtime.inputs.recordings import recordings, require_splits, step_of, warn_of_shared
 from spikeloom.runtime.machines.backends import backend_of
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import INLINE, OPTIONAL
@@ -149,7 +149,7 @@ def _splits(request: FinetuneRequest, loaded: LoadedNetwork) -> tuple[Recordings
             taxels=network.input.taxels,
             bin_s=request.bin,
             labels_for="fine-tuning",
-            trained=origin_of(loaded.training),
+            trained=origin_of(loaded.training) | step_of(loaded.read_as, network.input.bins),
         )
         for split in ("train", "test")
     )

@@ -204,9 +204,9 @@ def candidate(
 ) -> tuple[Rounded | None, bool]:
     """Best compromise between a fine weight scale and a fine threshold, see ``WORTHWHILE``.
 
-    Weights that are multiples of 1, 1/2, … 1/64 stay so, up to their scale. `factor` says how far the scale may exceed the
-    one that just holds the largest weight; the rest is clipped. Also whether registers, not that, limit the
-    scale: a larger factor gives the same.
+    Weights that are multiples of 1, 1/2, … 1/64 stay so, up to their scale. `factor` says how far the scale may
+    exceed the one that just holds the largest weight; the rest is clipped. Also whether registers, not that,
+    limit the scale: a larger factor gives the same.
     """
     bits = packing.bits
     peak = float(layer.peaks().max(initial=0))

@@ -1,0 +1,74 @@
+"""Into a netlist and out of it through NIR: what is not the same is said, or refused by name."""
+
+import made_nir
+import nir
+import numpy as np
+import pytest
+from commands import refusal, run
+from made_files import CLASSES, TAXELS, recordings_folder
+
+from spikeloom.compiler.formats.nir.reader import read_nir
+
+
+def two_layers(hidden, last, size=2 * TAXELS):
+    rng = np.random.default_rng(0)
+    first = made_nir.affine(rng, 12, size, 1.0)
+    return made_nir.chain(first, hidden, made_nir.affine(rng, CLASSES, 12, 1.5), last)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A NIR network read in steps of 0.05 s, its netlist and own export, and recordings in other bins."""
+    place = tmp_path_factory.mktemp("conversions")
+    nir.write(
+        place / "net.nir",
+        two_layers(made_nir.lif(12, tau=0.2, r=8.0), made_nir.lif(CLASSES, tau=0.2, r=8.0)),
+    )
+    recordings_folder(place / "data")
+    assert run("compile", place / "net.nir", "--dt", "0.05", "-o", place / "net.loom")[0] == 0
+    assert run("export", place / "net.loom", "--to", "nir", "-o", place / "own.nir")[0] == 0
+    return place
+
+
+@pytest.mark.parametrize("words", [("run",), ("estimate",), ("verify", "--checkpoint", "net.nir")])
+def test_bins_that_are_not_the_steps_of_a_nir_network_are_said(folder, monkeypatch, words):
+    monkeypatch.chdir(folder)
+    command, *more = words
+    said = "bins of 0.02 s, the network was read in steps of 0.05 s"
+    code, _, err = run(command, "net.loom", "--data", "data", *more)
+    assert (code, err.count(said)) == (0, 1)
+    (folder / "data" / "test" / "bins.npy").unlink(missing_ok=True)
+    same = folder / "same.loom"
+    assert run("compile", "net.nir", "--dt", "0.02", "-o", same)[0] == 0
+    assert "read in steps" not in run(command, same, "--data", "data", *more)[2]
+
+
+def test_calibration_on_other_bins_is_said(folder, tmp_path):
+    given = (
+        "compile",
+        folder / "net.nir",
+        "--dt",
+        "0.05",
+        "--calibrate",
+        folder / "data",
+        "-o",
+        tmp_path / "x.loom",
+    )
+    assert "the network was read in steps of 0.05 s" in run(*given)[2]
+
+
+def test_steps_that_a_file_states_are_not_overruled(folder, tmp_path):
+    own = folder / "own.nir"
+    assert read_nir(own).read_as == {"dt": 0.05, "convention": "euler"}  # those it was read in
+    for option, value in (("--dt", "0.02"), ("--convention", "exponential")):
+        words = refusal("compile", own, option, value, "-o", tmp_path / "x.loom")
+        assert words.startswith(f"{option} {value}: the file states") and words.endswith(f"omit {option}")
+    assert run("compile", own, "--dt", "0.05", "--convention", "euler", "-o", tmp_path / "x.loom")[0] == 0
+
+
+def test_a_start_at_the_reset_is_said():
+    plain = made_nir.lowered(two_layers(made_nir.lif(12), made_nir.lif(CLASSES))).facts
+    moved = made_nir.lowered(two_layers(made_nir.lif(12, reset=-0.2), made_nir.lif(CLASSES))).facts
+    said = [fact for fact in moved if "starts at its reset" in fact]
+    assert [fact.partition(":")[0] for fact in said] == ["n1"]
+    assert not any("starts at its reset" in fact for fact in plain)
