@@ -7,7 +7,11 @@ import pytest
 from commands import refusal, run
 from made_files import CLASSES, TAXELS, recordings_folder
 
+from spikeloom.compiler.counters import Counters
+from spikeloom.compiler.formats.counters import write_counters
 from spikeloom.compiler.formats.nir.reader import read_nir
+from spikeloom.compiler.targets.loihi1.lift import lift
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 
 
 def two_layers(hidden, last, size=2 * TAXELS):
@@ -62,7 +66,8 @@ def test_steps_that_a_file_states_are_not_overruled(folder, tmp_path):
     assert read_nir(own).read_as == {"dt": 0.05, "convention": "euler"}  # those it was read in
     for option, value in (("--dt", "0.02"), ("--convention", "exponential")):
         words = refusal("compile", own, option, value, "-o", tmp_path / "x.loom")
-        assert words.startswith(f"{option} {value}: the file states") and words.endswith(f"omit {option}")
+        assert words.startswith(f"{option} {value}: the file states")
+        assert words.endswith(f"omit {option}")
     assert run("compile", own, "--dt", "0.05", "--convention", "euler", "-o", tmp_path / "x.loom")[0] == 0
 
 
@@ -72,3 +77,64 @@ def test_a_start_at_the_reset_is_said():
     said = [fact for fact in moved if "starts at its reset" in fact]
     assert [fact.partition(":")[0] for fact in said] == ["n1"]
     assert not any("starts at its reset" in fact for fact in plain)
+
+
+def integers(path):
+    """All that decides what a netlist does."""
+    network = lift(read_netlist(path))
+    layers = [
+        (p.name, p.decay_u, p.decay_v, p.threshold.tolist(), p.bias.tolist()) for p in network.populations
+    ]
+    synapses = [(p.pre, p.post, p.effective().toarray().tolist()) for p in network.projections]
+    return network.input, layers, synapses, network.readout.label.tolist()
+
+
+@pytest.mark.parametrize("options", [(), ("--planes", "2")], ids=["a plane", "two planes"])
+def test_biases_of_later_currents_come_back(tmp_path, options):
+    rng = np.random.default_rng(0)
+    nodes = [
+        made_nir.affine(rng, 9, 6),
+        made_nir.cuba(9, r=2.0, weight=3.0, leak=0.1),
+        made_nir.affine(rng, 7, 9),
+        made_nir.lif(7, r=2.0),
+        made_nir.affine(rng, 4, 7),
+        made_nir.cuba(4, r=2.5, weight=2.0),
+    ]
+    nir.write(tmp_path / "net.nir", made_nir.chain(*nodes))
+    made = ("compile", tmp_path / "net.nir", "--dt", "0.02", "--keep-all", *options)
+    assert run(*made, "-o", tmp_path / "net.loom")[0] == 0
+    assert run("export", tmp_path / "net.loom", "--to", "nir", "-o", tmp_path / "own.nir")[0] == 0
+    assert run("compile", tmp_path / "own.nir", "--keep-all", "-o", tmp_path / "back.loom")[0] == 0
+    assert [layer[0] for layer in integers(tmp_path / "back.loom")[1]] == [
+        "n1",
+        "always1",
+        "n3",
+        "always2",
+        "n5",
+    ]
+    assert integers(tmp_path / "back.loom") == integers(tmp_path / "net.loom")
+    nir.read(tmp_path / "own.nir")
+
+
+def test_a_netlist_and_its_own_export_match_whatever_the_names_of_layers(tmp_path):
+    data = recordings_folder(tmp_path / "data")
+    network, netlist, own = (tmp_path / f"net.{ending}" for ending in ("pt", "loom", "nir"))
+    counter = np.array([(channel, 0, count) for count in (1, 2, 10) for channel in range(2 * TAXELS)])
+    weight = np.random.default_rng(0).integers(-9, 10, (CLASSES, len(counter)))
+    sizes = {
+        "taxels": TAXELS,
+        "polarities": 2,
+        "classes": CLASSES,
+        "bins": 1,
+        "steps": 10,
+        "parts": 1,
+        "ramp": 8,
+    }
+    write_counters(network, Counters(**sizes, counter=counter, weight=weight, slope=9.0, threshold=150.5))
+    assert run("compile", network, "-o", netlist)[0] == 0
+    assert run("export", netlist, "--to", "nir", "-o", own)[0] == 0
+    names = [layer.name for layer in read_netlist(netlist).layers]
+    assert names.index("count2") < names.index("count10")
+    assert [one.name for one in read_nir(own).network.populations] == names
+    code, _, err = run("verify", netlist, "--data", data, "--checkpoint", own)
+    assert code != 2, err

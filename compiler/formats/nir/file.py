@@ -12,6 +12,7 @@ References
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import networkx as nx
 import numpy as np
@@ -23,6 +24,9 @@ from spikeloom.compiler.formats.names import named, printable
 GRAPH = "NIRGraph"
 INPUT_NODE = "Input"
 OUTPUT_NODE = "Output"
+
+WRITER = "spikeloom"
+"""What files of our own say of their writer."""
 
 SPIKING = ("CubaLIF", "IF", "LIF", "Threshold")
 
@@ -64,11 +68,15 @@ def graph_of(tree: Tree, sha256: str) -> Graph:
     if entry_of(root, "type", str) != GRAPH:
         root = {"type": GRAPH, "nodes": {"node": root}, "edges": []}
     nodes, edges = _flat(root, "")
+    metadata = entry_of(root, "metadata", dict)
+    if entry_of(metadata, "writer", str) == WRITER:
+        # HDF5 sorts by name; edges are in the order of the netlist's layers
+        nodes = {name: nodes[name] for name in dict.fromkeys(chain.from_iterable(edges))} | nodes
     return Graph(
         nodes=nodes,
         edges=tuple(dict.fromkeys(edges)),
         version=entry_of(tree, "version", str),
-        metadata=entry_of(root, "metadata", dict),
+        metadata=metadata,
         sha256=sha256,
     )
 

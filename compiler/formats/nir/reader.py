@@ -127,7 +127,7 @@ def network_of(
     )
     training = json.loads(entry_of(graph.metadata, "training", str) or "null")
     return ReadNetwork(
-        network=replace(network, forms=_forms(spiking, network)),
+        network=replace(network, forms=_forms(graph, spiking, network)),
         facts=tuple(facts),
         sha256=graph.sha256,
         read_as=asdict(steps),
@@ -163,26 +163,36 @@ def _relays(weight: Sparse, bias: FloatArray, clocks: int) -> int:
     return clocks if found else 0
 
 
-def _forms(spiking: Sequence[Neurons], network: Network) -> tuple[Form, ...] | None:
+def _forms(graph: Graph, spiking: Sequence[Neurons], network: Network) -> tuple[Form, ...] | None:
     """Storage that a network was fine-tuned for, where all nodes say so; ModelError if no chip has it."""
     forms = {}
     for name, one in zip(unique_names([one.node.name for one in spiking]), spiking, strict=True):
         stored = replace(one.node, values=one.node.metadata)
         if not stored.has("bits"):
             return None
-        bits = stored.few("bits")[0]
-        exponents = stored.integers("exponents").ravel().tolist()
-        gaps = (0 < after - before <= plane_distance(bits) for before, after in pairwise(exponents))
-        within = 2 <= bits <= 8 and exponents and -8 <= exponents[0] and exponents[-1] < 8 and all(gaps)
-        whole = np.all(one.theta == np.rint(one.theta)) and one.theta.max() <= THRESHOLD_MANTISSA_MAX
-        if not within or not whole:
-            raise stored.fail("has no usable storage, or thresholds that are not whole; fine-tune it again")
-        forms[name] = Form(bits=bits, exponents=tuple(exponents), threshold=read_only(one.theta))
-    return (
-        tuple(forms[each.name] for each in network.populations)
-        if len(forms) == len(network.populations)
-        else None
+        forms[name] = _form(stored, one.theta)
+    for name in (population.name for population in network.populations if population.name not in forms):
+        relay = Node(name=name, type="", values=entry_of(graph.metadata, name, dict), metadata={})
+        if not relay.has("bits"):
+            return None
+        forms[name] = _form(relay, relay.numbers("threshold").ravel())
+    return tuple(forms[each.name] for each in network.populations)
+
+
+def _form(stored: Node, theta: FloatArray) -> Form:
+    """Storage of one layer, with its thresholds in weight units."""
+    bits = stored.few("bits")[0]
+    exponents = stored.integers("exponents").ravel().tolist()
+    gaps = (0 < after - before <= plane_distance(bits) for before, after in pairwise(exponents))
+    within = 2 <= bits <= 8 and exponents and -8 <= exponents[0] and exponents[-1] < 8 and all(gaps)
+    whole = (
+        theta.size
+        and np.all(theta == np.rint(theta))
+        and 0 < theta.min() <= theta.max() <= THRESHOLD_MANTISSA_MAX
     )
+    if not within or not whole:
+        raise stored.fail("has no usable storage, or thresholds that are not whole; fine-tune it again")
+    return Form(bits=bits, exponents=tuple(exponents), threshold=read_only(theta))
 
 
 def _walk(graph: Graph, steps: stages.Steps, shape: tuple[int, ...]) -> tuple[list[Neurons], stages.Value]:

@@ -10,7 +10,7 @@ number in every step, a float is not.
 * Time constants are those of the forward Euler method for the step given: ``1 - dt / tau`` is what a step keeps, and
   ``r = tau / dt`` makes a step add its input as it is.
 * Inputs are one flat axis, ``taxel * polarities + polarity``, then the clocks. A vote of several neurons is a Linear.
-* A channel that always has an event is a bias, as in the file that it was read from.
+* A channel that always has an event is a bias, as in the file that it was read from; so are the relays of it.
 
 Neurons that the chip leaves out are there and receive nothing.
 """
@@ -22,6 +22,7 @@ from spikeloom.compiler.dynamics import MOST_STEPS, Clocks
 from spikeloom.compiler.errors import ModelError
 from spikeloom.compiler.formats.hdf5 import Tree, hdf5_bytes
 from spikeloom.compiler.formats.names import plain_names
+from spikeloom.compiler.formats.nir.file import WRITER
 from spikeloom.compiler.formats.nir.stages import require_step
 from spikeloom.compiler.ir import INPUT, Sparse, added_up
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerPopulation
@@ -54,25 +55,30 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -
     always = int(network.input.clocks == Clocks(channels=1, steps=MOST_STEPS))
     nodes: dict[str, Tree] = {"input": {"type": "Input", "shape": np.array([network.input.size - always])}}
     edges: list[tuple[str, str]] = []
+    constant: list[int] = []
     for post, (population, name) in enumerate(zip(network.populations, names, strict=True)):
         bias = population.bias / (1 << MEMBRANE_SHIFT)
         sources = added_up((p.pre, p.effective()) for p in network.projections if p.post == post)
+        added = np.zeros(population.size)
+        if always and INPUT in sources:
+            added += sources[INPUT][:, [-1]].toarray().ravel()
+            sources[INPUT] = sources[INPUT][:, :-1]
+        added += sum(sources.pop(pre).toarray().ravel() for pre in constant if pre in sources)
+        received = any(weight.count_nonzero() for weight in sources.values())
+        if always and population.size == 1 and not received and added[0] > population.threshold[0]:
+            constant.append(post)  # it fires in every step: what it brings is a bias
+            continue
+        if population.decay_u == FORGETS:
+            added += bias
         for number, (pre, weight) in enumerate(sorted(sources.items())):
             source = "input" if pre == INPUT else names[pre]
             synapses = f"{source}_to_{name}"
-            dense = _dense(population, weight)
-            added = np.zeros(population.size)
-            if always and pre == INPUT:
-                dense, added = dense[:, :-1], dense[:, -1].astype(np.float64)
-            if population.decay_u == FORGETS and not number:
-                added = added + bias
-            nodes[synapses] = {"type": "Linear", "weight": dense}
-            if (population.decay_u == FORGETS and not number) or added.any():
+            nodes[synapses] = {"type": "Linear", "weight": _dense(population, weight)}
+            if not number and (population.decay_u == FORGETS or added.any()):
                 nodes[synapses] |= {"type": "Affine", "bias": added.astype(np.float32)}
             edges += [(source, synapses), (synapses, name)]
         nodes[name] = _neurons(population, bias, dt)
-        form = network.forms[post]
-        nodes[name]["metadata"] = {"bits": np.array(form.bits), "exponents": np.array(form.exponents)}
+        nodes[name]["metadata"] = _form(network, post)
     voters = names[network.readout.population]
     label = network.readout.label
     if np.array_equal(label, np.arange(network.classes)):
@@ -85,7 +91,7 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -
     nodes["output"] = {"type": "Output", "shape": np.array([network.classes])}
     said: Tree = {
         "dt": np.array(dt),
-        "writer": "spikeloom",
+        "writer": WRITER,
         "polarities": np.array(network.input.polarities),
     }
     bins = network.input.bins
@@ -94,9 +100,18 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -
     said |= {"length": np.array(clocks.length)} if clocks.length is not None else {}
     if clocks.channels and not always:
         said |= {"clocks": np.array(clocks.channels), "clock_steps": np.array(clocks.steps)}
+    for number, post in enumerate(constant, 1):
+        threshold = {"threshold": network.populations[post].threshold}
+        said[f"always{number}"] = _form(network, post) | threshold
     said |= {"training": training} if training is not None else {}
     graph = {"type": "NIRGraph", "edges": edges, "metadata": said, "nodes": nodes}
     return hdf5_bytes({"version": VERSION, "node": graph})
+
+
+def _form(network: IntegerNetwork, post: int) -> Tree:
+    """How a layer is stored."""
+    form = network.forms[post]
+    return {"bits": np.array(form.bits), "exponents": np.array(form.exponents)}
 
 
 def _dense(population: IntegerPopulation, weight: Sparse) -> Float32:
