@@ -34,6 +34,10 @@ def grid_cells(coordinates: FloatArray = NEUTOUCH) -> IntArray:
     >>> grid_cells().max(axis=0).tolist(), grid_cells()[1].tolist()
     ([12, 18], [1, 6])
     """
+    if coordinates.shape[1] == 1:
+        raise DataError(
+            "grid-cnn: where the taxels lie is not known; give --taxels a file with x and y of each"
+        )
     if coordinates.shape[1] != 2:
         raise DataError(
             f"grid-cnn: positions have {coordinates.shape[1]} numbers each, a grid needs x and y; give a flat sensor"

@@ -1,5 +1,7 @@
 """Into a netlist and out of it through NIR: what is not the same is said, or refused by name."""
 
+import shutil
+
 import made_nir
 import nir
 import numpy as np
@@ -138,3 +140,29 @@ def test_a_netlist_and_its_own_export_match_whatever_the_names_of_layers(tmp_pat
     assert [one.name for one in read_nir(own).network.populations] == names
     code, _, err = run("verify", netlist, "--data", data, "--checkpoint", own)
     assert code != 2, err
+
+
+def test_a_nir_file_of_another_name_is_recognised(folder, tmp_path):
+    shutil.copy(folder / "net.nir", tmp_path / "net.pt")
+    for options in ((), ("--dt", "0.02")):
+        words = refusal("compile", tmp_path / "net.pt", *options, "-o", tmp_path / "x.loom")
+        assert words.endswith("net.pt: is an HDF5 file, as NIR files are; let its name end in .nir")
+
+
+@pytest.mark.parametrize(
+    ("voted", "never"), [((0, 1, 2, 2), "3"), ((1, 3, 3, 1), "0, 2"), ((0, 1, 2, 3), "")]
+)
+def test_classes_that_nobody_votes_for_are_said(tmp_path, voted, never):
+    votes = np.zeros((4, 4))
+    votes[list(voted), range(4)] = 1
+    graph = made_nir.chain(
+        made_nir.affine(np.random.default_rng(0), 4, 4, 2.0), made_nir.lif(4), nir.Linear(votes)
+    )
+    nir.write(tmp_path / "net.nir", graph)
+    code, _, err = run(
+        "compile", tmp_path / "net.nir", "--dt", "0.02", "--keep-all", "-o", tmp_path / "net.loom"
+    )
+    assert code == 0
+    said = f"no neuron votes for class {never}, which is never decided"
+    assert (said in err) == bool(never)
+    assert read_netlist(tmp_path / "net.loom").classes == 4

@@ -29,6 +29,13 @@ def refused(call, *arguments, **options):
     return oracles.refused(ModelError, "", call, *arguments, **options)
 
 
+def declared(size):
+    """A network whose output says another number of classes."""
+    graph = two_layers()
+    graph.nodes["output"] = nir.Output(np.array([size]))
+    return graph
+
+
 def two_layers(last=None, first=None):
     """A small network, with nodes of it replaced."""
     return chain(affine(RNG, 5, 4), first or lif(5), affine(RNG, 3, 5), last or lif(3))
@@ -139,6 +146,7 @@ GRAPHS = [
     ),
     ("resets by subtraction (reset_mechanism = 'subtract')", subtracting),
     ("the graph resets by subtraction", subtracting_as_a_whole),
+    ("node output (Output): is declared [4], it gets [3]", lambda: declared(4)),
     ("gets weighted spikes of n1", lambda: chain(affine(RNG, 5, 4), lif(5), affine(RNG, 3, 5))),
     ("has no spiking neurons", lambda: chain(affine(RNG, 5, 4))),
     (

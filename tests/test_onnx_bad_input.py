@@ -97,6 +97,19 @@ NODES = [
         helper.make_node("Strange", ["current"], ["stage"], domain="my.own"),
     ),
 ]
+KEEPS = "k = Mul(u0, beta); m = Add(k, current)"
+AFTER = f"{KEEPS}; hot = Greater(m, theta); s0_new = Cast(hot)"
+BEFORE = "k = Mul(z, beta); u0_new = Add(k, current); hot = Greater(u0_new, theta); s0_new = Cast(hot)"
+ALONE = [("x", [1, 4]), ("u0", [1, 3])]
+RESETS = [
+    ("m (Add)", f"{AFTER}; p = Mul(s0_new, theta); u0_new = Sub(m, p)"),
+    ("m (Add)", f"{AFTER}; y = Sub(m, theta); u0_new = Where(hot, y, m)"),
+    ("m (Add)", f"{AFTER}; u0_new = Where(hot, b, m)"),
+    ("m (Add)", f"{KEEPS}; hot = Less(m, theta); s0_new = Cast(hot); u0_new = Where(hot, zero, m)"),
+    ("u0_new (Add)", f"low = Greater(u0, theta); y = Sub(u0, theta); z = Where(low, y, u0); {BEFORE}"),
+]
+"""Resets after the spike or before the next step that are none to zero: which operator is named."""
+
 NEURONS = [
     (
         "loses 0.5 for a spike of s0, a reset by",
@@ -111,6 +124,14 @@ NEURONS = [
 ]
 
 REFUSED = [
+    *[
+        (f"node {where}: keeps u0, which its spikes do not reset to zero (but by", layer(text, inputs=ALONE))
+        for where, text in RESETS
+    ],
+    (
+        "resets u0 at u >= 0.5 and fires at u > 0.5; compare both alike",
+        layer(f"low = Less(u0, theta); z = Where(low, u0, zero); {BEFORE}", inputs=ALONE),
+    ),
     *[(words, with_stage(written(text))) for words, text in STAGES],
     *[(words, with_stage([made], domains=["my.own"])) for words, made in NODES],
     *[(f"node u0_new (Add): {words}", layer(text)) for words, text in NEURONS],

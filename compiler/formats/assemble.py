@@ -84,7 +84,7 @@ def by_depth(layers: Sequence[Layer]) -> list[list[int]]:
     return ready
 
 
-def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArray) -> Network:
+def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArray, classes: int) -> Network:
     """Network of layers in any order; the spikes of `voters` are counted, `label` is the class of each of its neurons.
 
     Raises ModelError if the layers are in a circle, some are not reached from the input, skip a layer, or
@@ -108,7 +108,7 @@ def assemble(layers: Sequence[Layer], sensor: Input, voters: int, label: IntArra
         populations=tuple(populations),
         projections=tuple(projections),
         readout=Readout(population=place[voters], label=label),
-        classes=int(label.max(initial=0)) + 1,
+        classes=classes,
     )
     _require_reach(network)
     return network

@@ -81,7 +81,7 @@ def counting_network(counters: Counters) -> Network:
     one = sparse.csr_array(sparse.eye_array(counters.classes))
     votes = add("votes", 0.0, 0.5, {sums: one, sums + 1: one.copy()})
     sensor = Input(taxels=counters.taxels, polarities=counters.polarities, clocks=clocks, bins=counters.bins)
-    return assemble(layers, sensor, votes, np.arange(counters.classes))
+    return assemble(layers, sensor, votes, np.arange(counters.classes), counters.classes)
 
 
 def write_counters(path: str | os.PathLike[str], counters: Counters) -> str:

@@ -25,6 +25,9 @@ E = TypeVar("E")
 
 AGAIN = "export it again"
 
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+"""What such a file begins with."""
+
 MOST_SECONDS = 3
 """CPU time that reading a file may take; 256 MiB of numbers take one second."""
 
@@ -77,6 +80,15 @@ def entry_of(group: Tree, key: str, kind: type[E]) -> E:
     """An entry of a group that is of a kind, else an empty one of that kind."""
     entry = group.get(key)
     return entry if isinstance(entry, kind) else kind()
+
+
+def is_hdf5(path: str) -> bool:
+    """Whether there is a file of this format, by its first bytes."""
+    if not Path(path).is_file():  # a pipe would wait for ever
+        return False
+    with contextlib.suppress(OSError), Path(path).open("rb") as file:
+        return file.read(len(SIGNATURE)) == SIGNATURE
+    return False
 
 
 def read_hdf5(path: Path, what: str) -> tuple[Tree, str]:

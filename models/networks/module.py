@@ -53,9 +53,10 @@ class _Stages:
             responses = self.respond([first[:1] if self.batched else first])
         except (IndexError, RuntimeError) as error:
             shape = tuple(first.shape)
-            raise ModelError(
-                f"module: fails on the example of shape {shape} ({error}); give one step's input"
-            ) from None
+            remedy = "give one step's input"
+            if "dtype" in str(error) or "ouble" in str(error):
+                remedy = "it is read in float64, so let its forward take types from its input (x.dtype) and make none"
+            raise ModelError(f"module: fails on the example of shape {shape} ({error}); {remedy}") from None
         self.names = tuple(names[id(layer)] or type(layer).__name__ for layer in self.order)
         for layer, name in zip(self.order, self.names, strict=True):
             if (calls := sum(each is layer for each in self.order)) > 1:
@@ -193,4 +194,4 @@ def module_network(
             "module: its output is no count of the spikes of its last LIF layer; return these spikes, or their sum "
             "over a group of neurons for each class"
         )
-    return assemble(layers, sensor, given[0] - 1, label)
+    return assemble(layers, sensor, given[0] - 1, label, len(bias[-1]))

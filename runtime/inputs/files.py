@@ -6,19 +6,14 @@ import zipfile
 from collections.abc import Callable, Iterable
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import beside, remove_leftovers, write_atomically
 from spikeloom.compiler.formats import NETWORKS, NIR, ONNX
 from spikeloom.models.recordings.classes import class_in_name
-from spikeloom.runtime.report.drawing import PICTURES, Drawing
+from spikeloom.runtime.report.drawing import Drawing
 from spikeloom.runtime.requests.fields import Request
-
-if TYPE_CHECKING:
-    from spikeloom.runtime.requests.check import CertifyRequest, StressRequest
-    from spikeloom.runtime.requests.training import TrainRequest
 
 _RECORDINGS = "recordings are shown by spikeloom data describe"
 
@@ -54,6 +49,16 @@ INPUTS = (
 )
 """Arguments that may name a file to read."""
 
+OUTPUTS = {
+    "output": "-o",
+    "certificate": "--certificate",
+    "network": "--network",
+    "html": "--html",
+    "spikes": "--spikes",
+    "picture": "--picture",
+}
+"""Arguments that may name a file to write, and their options."""
+
 
 def require_place(
     path: str | None, option: str, request: Request | None = None, kinds: Iterable[str] = ()
@@ -61,8 +66,8 @@ def require_place(
     """Refuse, before any work is done, a place where a result could not be written; nothing to do without one.
 
     Raises OptionError if there is no such folder, or none that takes a file, the path is a folder or a
-    device, has another suffix than one of the `kinds`, or is one of the `INPUTS` of `request`, which must
-    not be overwritten.
+    device, has another suffix than one of the `kinds`, is another of the `OUTPUTS` of `request`, or one of
+    its `INPUTS`, which must not be overwritten.
     """
     if path is None:
         return
@@ -83,6 +88,7 @@ def require_place(
         part.unlink()
     except OSError as error:
         raise OptionError(f"{option} {path}: cannot be written ({error.strerror}); name another") from error
+    _require_apart(place, request)
     for name in INPUTS if place.exists() else ():
         given = getattr(request, name, None)
         for each in given if isinstance(given, tuple) else [given]:
@@ -94,19 +100,16 @@ def require_place(
         raise OptionError(f"{option} {path}: has to end in {' or '.join(allowed)}; give another name")
 
 
-def require_picture(
-    request: CertifyRequest | StressRequest | TrainRequest, outputs: Iterable[str | Path | None]
-) -> None:
-    """Refuse a ``--picture`` that could not be written, of another kind than is drawn, or that is one of the `outputs`.
-
-    Raises OptionError.
-    """
-    path = request.picture
-    if path is None:
-        return
-    require_place(path, "--picture", request, PICTURES)
-    if Path(path).absolute() in [Path(output).absolute() for output in outputs if output is not None]:
-        raise OptionError(f"--picture {path}: is also the -o file; give another name")
+def _require_apart(place: Path, request: object) -> None:
+    """Refuse a place that several options name."""
+    given = {option: getattr(request, name, None) for name, option in OUTPUTS.items()}
+    same = [
+        option
+        for option, path in given.items()
+        if isinstance(path, str) and Path(path).resolve() == place.resolve()
+    ]
+    if len(same) > 1:
+        raise OptionError(f"{same[-1]} {place}: is also the {same[0]} file; give another name")
 
 
 def write_picture(path: str | None, draw: Callable[[], Drawing]) -> None:

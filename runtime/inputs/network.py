@@ -11,6 +11,7 @@ from spikeloom.compiler.checkpoint import Checkpoint
 from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.formats import NETX, NIR, ONNX
 from spikeloom.compiler.formats.assemble import ReadNetwork
+from spikeloom.compiler.formats.hdf5 import is_hdf5
 from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand
@@ -210,6 +211,8 @@ def _require_fit(path: str, reader: Reader, request: NetworkChoice) -> None:
         raise OptionError(
             f"{path}: holds integers, no float network to compare with; compile, inspect and run it"
         )
+    if reader is CHECKPOINT and is_hdf5(path):
+        raise ModelError(f"{path}: is an HDF5 file, as NIR files are; let its name end in {NIR}")
     for name in (*NETWORK, *LAYOUT):
         if name not in reader.options:
             titles = " or ".join(other.title for other in READERS if name in other.options)

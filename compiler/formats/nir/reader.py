@@ -120,7 +120,7 @@ def network_of(
     voters, label = _readout(end, result, spiking)
     layers, constant = _layers(spiking, positions, sensor.clocks.channels)
     layers, sensor = _with_held(layers, constant, sensor)
-    network = assemble(layers, sensor, voters, label)
+    network = assemble(layers, sensor, voters, label, result.size)
     facts = _facts(graph, steps, spiking, f"input {printable(entry.name)}: {words}", sensor)
     facts.append(
         f"classes: the spikes of {printable(spiking[voters].node.name)} in output {printable(end.name)}"
@@ -311,6 +311,10 @@ def _readout(end: Node, result: stages.Value, spiking: Sequence[Neurons]) -> tup
         raise end.fail(f"gets the membranes of a leaky integrator, a chip counts spikes; {remedy}")
     if len(result.terms) != 1 or INPUT in result.terms:
         raise end.fail(f"gets no count of the spikes of one layer; {remedy}")
+    if end.has("shape") and math.prod(declared := end.integers("shape").ravel().tolist()) != result.size:
+        raise end.fail(
+            f"is declared {declared}, it gets {list(result.shape)}; the shapes disagree, export it again"
+        )
     ((source, counts),) = result.terms.items()
     label = class_of_each(counts)
     if label is None or (result.bias.size and np.ptp(result.bias) > 0):

@@ -118,9 +118,15 @@ def _carried(
     if table.atoms[gate].kind == SPIKE:
         old = table.atoms[gate]
         new = table.atoms[spike]
-        if not np.array_equal(old.theta, new.theta) or old.strict != new.strict:
+        if not np.array_equal(old.theta, new.theta):
             raise ModelError(
                 f"resets {table.atoms[previous]} by another threshold than it fires by; {RESET}"
+            )
+        if old.strict != new.strict:
+            signs = [">" if atom.strict else ">=" for atom in (old, new)]
+            raise ModelError(
+                f"resets {table.atoms[previous]} at u {signs[0]} {old.theta[0]:g} and fires at u {signs[1]} "
+                f"{new.theta[0]:g}; compare both alike, {RESET}"
             )
     if table.atoms[previous].kind == INPUT_ATOM:
         _require_output(outputs, {membrane: 1.0}, f"membrane of {table.atoms[previous]}")
@@ -261,6 +267,19 @@ def _data(table: Table, neurons: Sequence[Neurons]) -> int:
         raise ModelError(
             f"{received[mixed[0]].node}: takes the state {label} of a layer as its input, a recurrent connection, "
             "which is not read from ONNX; export the network as NIR"
+        )
+    kept = [
+        (received[atom], atom)
+        for atom in data
+        if received[atom].previous is None
+        and table.atoms[atom].size == len(received[atom].bias)
+        and diagonal(received[atom].current[atom], EQUAL) is not None
+    ]
+    if len(data) > 1 and kept:
+        n, atom = kept[-1]
+        raise ModelError(
+            f"{n.node}: keeps {table.atoms[atom]}, which its spikes do not reset to zero (but by subtraction, to "
+            f"another value or where it is small); {RESET}"
         )
     if len(data) != 1:
         named = ", ".join(f"{table.atoms[atom]} ({table.atoms[atom].size})" for atom in data)

@@ -79,7 +79,7 @@ def _network(file: Graph, polarities: int | None, polarities_first: bool | None)
         )
         for name, layer, sources in zip(names, groups.layers, groups.sources, strict=True)
     ]
-    network = assemble(layers, sensor, voters, label)
+    network = assemble(layers, sensor, voters, label, len(outputs[counted].bias))
     facts += _facts(file, table, groups, outputs, names, words)
     facts.append(f"classes: the spikes of {names[voters]} in output {printable(counted)}")
     return ReadNetwork(network=network, facts=tuple(facts), sha256=file.sha256)

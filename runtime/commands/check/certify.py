@@ -8,10 +8,11 @@ from spikeloom.compiler.errors import require_least
 from spikeloom.compiler.files import sha256_of
 from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.inputs.checkpoint import places_of
-from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
+from spikeloom.runtime.inputs.files import require_place, write_picture
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.report.console import tell
+from spikeloom.runtime.report.drawing import PICTURES
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.check import CertifyRequest
@@ -41,7 +42,7 @@ def run(request: CertifyRequest) -> Outcome:
     """Run the command."""
     require_place(request.output, "-o", request)
     require_place(request.certificate, "--certificate", request)
-    require_picture(request, [request.output, request.certificate])
+    require_place(request.picture, "--picture", request, PICTURES)
     require_least(vars(request), shift=0, most=1, jobs=1)
     machine = machine_for(request.netlist)
     data = load_recordings(request.data, request, machine.netlist, labels_for="certify", joined=False)

@@ -1,7 +1,8 @@
 """The command ``stress``: where float network and chip break, and whether at the same place."""
 
 from spikeloom.compiler.errors import OptionError, require_least
-from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
+from spikeloom.runtime.inputs.files import require_place, write_picture
+from spikeloom.runtime.report.drawing import PICTURES
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.check import StressRequest
@@ -25,7 +26,7 @@ REQUEST = StressRequest
 def run(request: StressRequest) -> Outcome:
     """Run the command; exit code 1 where a requirement is missed."""
     require_place(request.output, "-o", request)
-    require_picture(request, [request.output])
+    require_place(request.picture, "--picture", request, PICTURES)
     require_least(vars(request), seeds=1, jobs=1)
     chosen = list(SAMPLED) if request.only is None else [name.strip() for name in request.only.split(",")]
     for name in chosen:

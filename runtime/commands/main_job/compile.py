@@ -7,7 +7,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.formats.text import text
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.machines.backends import backend_of, trained_for
-from spikeloom.runtime.report.console import Progress
+from spikeloom.runtime.report.console import Progress, tell
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.main_job import CompileRequest
 
@@ -36,4 +36,9 @@ def run(request: CompileRequest) -> Outcome:
 
     lowered = backend.lower(request, dump)
     sha256 = lowered.write(request.output)
+    voted = lowered.netlist.readout_class
+    if never := [str(each) for each in range(lowered.netlist.classes) if each not in voted]:
+        tell(
+            f"warning: {request.output}: no neuron votes for class {', '.join(never)}, which is never decided"
+        )
     return lowered.report(sha256)

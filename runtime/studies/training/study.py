@@ -11,8 +11,9 @@ from spikeloom.models.training.recipes import RELEASED
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.checkpoint import given_places, sensor_places
 from spikeloom.runtime.inputs.compilation import whole_numbers
-from spikeloom.runtime.inputs.files import require_picture, require_place, write_picture
+from spikeloom.runtime.inputs.files import require_place, write_picture
 from spikeloom.runtime.inputs.recordings import require_bins
+from spikeloom.runtime.report.drawing import PICTURES
 from spikeloom.runtime.requests.training import TrainRequest
 from spikeloom.runtime.studies.counting import CountersReport, train_counters
 from spikeloom.runtime.studies.left_out import announce, condition_folds, networks_left_out
@@ -44,7 +45,7 @@ def train_networks(request: TrainRequest) -> TrainingReport:
     require_least(vars(request), seeds=1, epochs=1, decay_epochs=1, seed=0)
     require_bins(request.join)
     require_place(request.output, "-o", request, ["pt"])
-    require_picture(request, ())
+    require_place(request.picture, "--picture", request, PICTURES)
     recipe_of(request)  # which refuses, before the recordings are read
     graph, _ = sensor_of(request)
     percent = WHOLE if request.window is None else parse_window(request.window)
