@@ -22,6 +22,9 @@ from spikeloom.models.networks.lif import LIF, reset
 AFFINE_TOLERANCE = 1e-9
 """Largest deviation from affinity, relative to the stage's largest response, that rounding in float64 explains."""
 
+FLOAT32 = 1e-5
+"""Largest one that rounding in float32 explains."""
+
 ROWS = 256
 """Neurons whose weights are read together."""
 
@@ -144,10 +147,11 @@ def _require_affine(stages: _Stages, weights: list[list[Sparse]], biases: list[F
                 np.abs(expected).max(initial=0), 1e-300
             )
             if not off <= AFFINE_TOLERANCE:
+                hint = ", as of float32 made inside it" if off < FLOAT32 else ""
                 raise ModelError(
                     f"module: {what} is not affine (a random combination of inputs is off by {off:.2g} of the "
-                    f"response, {AFFINE_TOLERANCE:g} allowed); only stages that are affine in what comes in this step "
-                    "become synapses"
+                    f"response{hint}, {AFFINE_TOLERANCE:g} allowed); only stages that are affine in what comes in this "
+                    "step become synapses"
                 )
 
 

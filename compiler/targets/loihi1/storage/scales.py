@@ -194,9 +194,10 @@ def _unit(projections: Sequence[Projection]) -> float:
     finest = [p.weight.data * 64 for p in projections]
     if not all(np.array_equal(each, np.rint(each)) for each in finest):
         return 0.0
-    return next(
-        unit for unit in 2.0 ** -np.arange(7) if all(np.all(each % (64 * unit) == 0) for each in finest)
-    )
+    for unit in (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32):
+        if all(np.all(each % (64 * unit) == 0) for each in finest):
+            return unit
+    return 1 / 64
 
 
 def candidate(

@@ -16,7 +16,7 @@ from spikeloom.compiler.targets.loihi1.bounds import extreme_membranes, one_side
 from spikeloom.compiler.targets.loihi1.integers import IntegerPopulation
 from spikeloom.compiler.targets.loihi1.registers import DECAY_ONE, MEMBRANE_SHIFT, encode_bias
 from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded
-from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
+from spikeloom.compiler.types import BoolArray, IntArray
 
 WHOLE = 2.0**20
 """Real weights that are multiples of one part of so many can add up to a threshold exactly."""
@@ -50,7 +50,8 @@ def _bounds(stored: Rounded, step: IntArray) -> tuple[IntArray, IntArray, BoolAr
     chip = stored.population
     threshold = chip.threshold << MEMBRANE_SHIFT
     up, down = (side << MEMBRANE_SHIFT for side in one_sided(stored.projections, chip.size))
-    lowest = extreme_membranes(chip.threshold, chip.bias, chip.decay_v, up, down)[1]
+    floats = up.astype(np.float64), down.astype(np.float64)
+    lowest = extreme_membranes(chip.threshold, chip.bias, chip.decay_v, *floats)[1]
     below = np.ceil(lowest / DECAY_ONE).astype(np.int64) + 1  # the bias is still to move
     above = threshold // DECAY_ONE
     fires = (threshold - chip.bias) // np.maximum(step, 1) + 1
@@ -105,7 +106,7 @@ def ties_moved(layer: FloatLayer, stored: Rounded) -> int:
     else:
         reach = np.sum([weight.maximum(0).sum(axis=1) for weight in floats.values()], axis=0)
         tied &= due * step <= reach
-    same = _alike(floats, weights, chip_step / np.maximum(step, 1)) & (chip_step > 0)
+    same = _alike(floats, weights, np.maximum(step, 1), chip_step) & (chip_step > 0)
     same &= ((chip.threshold << MEMBRANE_SHIFT) - chip.bias) // np.maximum(chip_step, 1) == due
     same &= _keeps_apart(population.beta, chip, stored, chip_step)
     return int(np.count_nonzero(tied & ~same))
@@ -114,15 +115,18 @@ def ties_moved(layer: FloatLayer, stored: Rounded) -> int:
 def _keeps_apart(beta: float, chip: IntegerPopulation, stored: Rounded, step: IntArray) -> BoolArray:
     """Which neurons decide by their sums alone, whatever the rest that the membrane keeps."""
     if beta:
-        return chip.bias == 0
+        return np.asarray(chip.bias == 0)
     low, high, concerned = _bounds(stored, step)
     return ~concerned | ((low <= chip.bias) & (chip.bias <= high))
 
 
-def _alike(floats: Mapping[int, Sparse], weights: Mapping[int, Sparse], ratio: FloatArray) -> BoolArray:
-    """Which neurons have weights that are the real ones, times a ratio."""
-    alike = np.ones(len(ratio), bool)
+def _alike(
+    floats: Mapping[int, Sparse], weights: Mapping[int, Sparse], step: IntArray, chip_step: IntArray
+) -> BoolArray:
+    """Which neurons have as many steps in each weight as the real one."""
+    alike = np.ones(len(step), bool)
     for pre, weight in floats.items():
-        apart = abs(sparse.diags_array(ratio) @ weight - weights[pre]).max(axis=1)
+        steps = (sparse.diags_array(1 / step) @ weight).rint()
+        apart = abs(sparse.diags_array(chip_step.astype(np.float64)) @ steps - weights[pre]).max(axis=1)
         alike &= apart.toarray().ravel() == 0
     return alike
