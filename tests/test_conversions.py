@@ -64,13 +64,15 @@ def test_calibration_on_other_bins_is_said(folder, tmp_path):
 
 
 def test_steps_that_a_file_states_are_not_overruled(folder, tmp_path):
-    own = folder / "own.nir"
-    assert read_nir(own).read_as == {"dt": 0.05, "convention": "euler"}  # those it was read in
+    exported = folder / "own.nir"
+    assert read_nir(exported).read_as == {"dt": 0.05, "convention": "euler"}  # those it was read in
     for option, value in (("--dt", "0.02"), ("--convention", "exponential")):
-        words = refusal("compile", own, option, value, "-o", tmp_path / "x.loom")
+        words = refusal("compile", exported, option, value, "-o", tmp_path / "x.loom")
         assert words.startswith(f"{option} {value}: the file states")
         assert words.endswith(f"omit {option}")
-    assert run("compile", own, "--dt", "0.05", "--convention", "euler", "-o", tmp_path / "x.loom")[0] == 0
+    assert (
+        run("compile", exported, "--dt", "0.05", "--convention", "euler", "-o", tmp_path / "x.loom")[0] == 0
+    )
 
 
 def test_a_start_at_the_reset_is_said():
@@ -120,7 +122,7 @@ def test_biases_of_later_currents_come_back(tmp_path, options):
 
 def test_a_netlist_and_its_own_export_match_whatever_the_names_of_layers(tmp_path):
     data = recordings_folder(tmp_path / "data")
-    network, netlist, own = (tmp_path / f"net.{ending}" for ending in ("pt", "loom", "nir"))
+    network, netlist, exported = (tmp_path / f"net.{ending}" for ending in ("pt", "loom", "nir"))
     counter = np.array([(channel, 0, count) for count in (1, 2, 10) for channel in range(2 * TAXELS)])
     weight = np.random.default_rng(0).integers(-9, 10, (CLASSES, len(counter)))
     sizes = {
@@ -134,11 +136,11 @@ def test_a_netlist_and_its_own_export_match_whatever_the_names_of_layers(tmp_pat
     }
     write_counters(network, Counters(**sizes, counter=counter, weight=weight, slope=9.0, threshold=150.5))
     assert run("compile", network, "-o", netlist)[0] == 0
-    assert run("export", netlist, "--to", "nir", "-o", own)[0] == 0
+    assert run("export", netlist, "--to", "nir", "-o", exported)[0] == 0
     names = [layer.name for layer in read_netlist(netlist).layers]
     assert names.index("count2") < names.index("count10")
-    assert [one.name for one in read_nir(own).network.populations] == names
-    code, _, err = run("verify", netlist, "--data", data, "--checkpoint", own)
+    assert [one.name for one in read_nir(exported).network.populations] == names
+    code, _, err = run("verify", netlist, "--data", data, "--checkpoint", exported)
     assert code != 2, err
 
 

@@ -15,6 +15,8 @@ number in every step, a float is not.
 Neurons that the chip leaves out are there and receive nothing.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -52,7 +54,7 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -
     names = plain_names(
         [population.name for population in network.populations], taken=["input", "output", "class_counts"]
     )
-    always = int(network.input.clocks == Clocks(channels=1, steps=MOST_STEPS))
+    always = _always(network)
     nodes: dict[str, Tree] = {"input": {"type": "Input", "shape": np.array([network.input.size - always])}}
     edges: list[tuple[str, str]] = []
     constant: list[int] = []
@@ -89,6 +91,18 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -
         nodes["class_counts"] = {"type": "Linear", "weight": votes}
         edges += [(voters, "class_counts"), ("class_counts", "output")]
     nodes["output"] = {"type": "Output", "shape": np.array([network.classes])}
+    said = _said(network, dt, constant) | ({"training": training} if training is not None else {})
+    graph = {"type": "NIRGraph", "edges": edges, "metadata": said, "nodes": nodes}
+    return hdf5_bytes({"version": VERSION, "node": graph})
+
+
+def _always(network: IntegerNetwork) -> bool:
+    """Whether the only clock is a channel that always has an event."""
+    return network.input.clocks == Clocks(channels=1, steps=MOST_STEPS)
+
+
+def _said(network: IntegerNetwork, dt: float, constant: Sequence[int]) -> Tree:
+    """Metadata of the file, with the storage of those layers that are `constant`."""
     said: Tree = {
         "dt": np.array(dt),
         "writer": WRITER,
@@ -98,14 +112,12 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -
     clocks = network.input.clocks
     said |= {"bins": np.array(bins)} if bins > 1 else {}
     said |= {"length": np.array(clocks.length)} if clocks.length is not None else {}
-    if clocks.channels and not always:
+    if clocks.channels and not _always(network):
         said |= {"clocks": np.array(clocks.channels), "clock_steps": np.array(clocks.steps)}
     for number, post in enumerate(constant, 1):
         threshold = {"threshold": network.populations[post].threshold}
         said[f"always{number}"] = _form(network, post) | threshold
-    said |= {"training": training} if training is not None else {}
-    graph = {"type": "NIRGraph", "edges": edges, "metadata": said, "nodes": nodes}
-    return hdf5_bytes({"version": VERSION, "node": graph})
+    return said
 
 
 def _form(network: IntegerNetwork, post: int) -> Tree:

@@ -98,9 +98,10 @@ def _onnx(request: ExportRequest) -> Export:
 def _nir(request: ExportRequest) -> Export:
     netlist = _legal(request.source)
     origin = origin_of(netlist.provenance)
-    read_in = netlist.provenance.get("dt", BIN_S * netlist.bins)
-    own = origin["bin_s"] * netlist.bins if "bin_s" in origin else read_in
-    dt = own if request.dt is None else request.dt
+    dt = request.dt
+    if dt is None:
+        read_in = netlist.provenance.get("dt", BIN_S * netlist.bins)
+        dt = origin["bin_s"] * netlist.bins if "bin_s" in origin else read_in
     facts = NirFacts(
         neurons=sum(layer.neurons for layer in netlist.layers),
         synapses=netlist.n_synapses,
