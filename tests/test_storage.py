@@ -171,10 +171,11 @@ def test_every_recipe_gives_a_proven_legal_network(network, bits, planes, groups
         assert 1 <= choice.planes <= planes
         assert choice.scale <= choice.finest_scale
         assert_allclose(population.realised_theta, model.theta, rtol=1e-15)
-        # a bias is off by half a unit of its register at most
+        # a bias is off by half a unit of its register at most, but where it makes up for what no membrane forgets
         unit = 2.0**population.bias_exponent / (64 * population.scale)
         error = population.bias / (64 * population.scale) - model.bias
-        assert choice.compensated or np.all(np.abs(error) <= unit / 2 * (1 + 1e-9))
+        moved = choice.compensated or (model.beta == 0 and model.alpha == 0)
+        assert moved or np.all(np.abs(error) <= unit / 2 * (1 + 1e-9))
     for projection in integer.projections:
         assert projection.bits == bits
         assert projection.exponent in LOIHI.choices["synapse.exponent"]

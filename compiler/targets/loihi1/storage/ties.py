@@ -14,7 +14,13 @@ from scipy import sparse
 from spikeloom.compiler.ir import Sparse, added_up
 from spikeloom.compiler.targets.loihi1.bounds import extreme_membranes, one_sided
 from spikeloom.compiler.targets.loihi1.integers import IntegerPopulation
-from spikeloom.compiler.targets.loihi1.registers import DECAY_ONE, MEMBRANE_SHIFT, encode_bias
+from spikeloom.compiler.targets.loihi1.registers import (
+    BIAS_EXPONENT_MAX,
+    BIAS_MANTISSA_MAX,
+    DECAY_ONE,
+    MEMBRANE_SHIFT,
+    encode_bias,
+)
 from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded
 from spikeloom.compiler.types import BoolArray, IntArray
 
@@ -66,9 +72,10 @@ def without_memory(layer: FloatLayer, stored: Rounded) -> Rounded:
         return stored
     low, high, concerned = _bounds(stored, _steps(_stored(stored)))
     usable = concerned & (low <= high)
-    mantissa, exponent = encode_bias(
-        np.where(usable, np.clip(chip.bias, low, high), chip.bias).astype(float)
-    )
+    usable[chip.size - layer.population.relays :] = False  # a relay has no bias
+    most = BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX
+    wanted = np.where(usable, np.clip(chip.bias, low, high), chip.bias)
+    mantissa, exponent = encode_bias(np.clip(wanted, -most, most).astype(np.float64))
     bias = mantissa << exponent
     usable &= (low <= bias) & (bias <= high)
     return replace(
