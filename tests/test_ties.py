@@ -5,8 +5,10 @@ import pytest
 import random_networks as nets
 from numpy.testing import assert_array_equal
 
+from spikeloom.compiler.formats.nir.reader import read_nir
+from spikeloom.compiler.formats.nir.writer import export
 from spikeloom.compiler.interpret import run_float
-from spikeloom.compiler.storage import Fixed, Packing
+from spikeloom.compiler.storage import Fixed, Given, Packing
 from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.options import Options
@@ -61,3 +63,14 @@ def test_ties_that_a_storage_decides_otherwise_are_said():
     outcome = compiled.outcome(done, "0" * 64)
     said = " ".join(terminal(outcome.sections(outcome.result)).split())
     assert "fc1: 1 neuron can get sums of exactly the threshold and, rounded, may decide" in said
+
+
+def test_what_makes_up_for_the_memory_comes_back_from_an_export(tmp_path):
+    integer = lift(compile_network(nets.chain([[1.0, 1.0, 1.0, 1.0]], beta=0.0, theta=2.0)).netlist)
+    assert integer.populations[0].bias < 0
+    (tmp_path / "own.nir").write_bytes(export(integer, 0.02))
+    found = read_nir(tmp_path / "own.nir", polarities=1).network
+    back = lift(compile_network(found, Options(storage=Given(found.forms), keep_all=True)).netlist)
+    assert_array_equal(back.populations[0].bias, integer.populations[0].bias)
+    given = events()
+    assert_array_equal(run_integer(back, given).spikes[0], run_integer(integer, given).spikes[0])
