@@ -245,7 +245,7 @@ def options() -> list[bytes]:
         "certify": shared | {"shift": 1, "most": 2, "jobs": 1},
         "compile": {
             "checkpoint": str(made["network"]),
-            "weight-bits": [8, 4, 4],
+            "weight-bits": [8, 4, 4, 4],
             "output": "written/x.loom",
         },
     }
