@@ -16,6 +16,7 @@ from spikeloom.compiler.interpret import channels_last, run_float
 from spikeloom.compiler.passes.calibrate import FEW, evenly_spaced
 from spikeloom.compiler.storage import Cheapest, Fixed, Packing
 from spikeloom.compiler.targets.loihi1.integers import run_integer
+from spikeloom.compiler.targets.loihi1.netlist import FILE
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.loihi1.storage.held_out import HELD, KEPT, split
@@ -53,7 +54,7 @@ def test_what_is_held_out_chooses_no_scale(count):
 def test_the_cheapest_that_keeps_enough_is_chosen_and_what_was_tried_is_counted(keep):
     network, events = unlike()
     done = compile_network(network, Options(training_events=events, storage=Cheapest(keep)))
-    few, several, held = split(len(events))
+    few, _, held = split(len(events))
     draw = np.random.default_rng(0)
     thinned = channels_last(
         np.stack([one * (draw.random(one.shape, np.float32) < KEPT) for one in events[held]])
@@ -62,10 +63,7 @@ def test_the_cheapest_that_keeps_enough_is_chosen_and_what_was_tried_is_counted(
     known, found = channels_last(events[few]), []
     sent = [known, *run_float(network, known).spikes]
     for trial, packing in zip(done.trials, LADDER, strict=False):
-        training = (
-            events[several] if packing.planes > 1 else events
-        )  # of which a width that is given takes few
-        one = compile_network(network, Options(storage=Fixed((packing,)), training_events=training))
+        one = compile_network(network, Options(storage=Fixed((packing,)), training_events=events))
         equal = (decisions(run_integer(one.integer, thinned).spikes[-1])[0] == wanted) & voted
         assert (trial.equal, trial.decisions) == (equal.sum(), voted.sum())
         assert trial.cores == one.netlist.n_cores
@@ -84,6 +82,19 @@ def test_the_cheapest_that_keeps_enough_is_chosen_and_what_was_tried_is_counted(
     chosen = LADDER[shares.index(max(shares))]
     assert done.netlist.provenance["planes"] == chosen.planes
     assert done.netlist.provenance["scale_groups"] == chosen.groups
+
+
+@pytest.mark.parametrize("pruned", [False, True])
+def test_storage_that_is_asked_for_gives_the_netlist_that_is_found(pruned):
+    network, events = unlike(samples=200)
+    options = Options(training_events=events, prune_unused=pruned)
+    found = compile_network(network, replace(options, storage=Cheapest(1.0)))
+    chosen = found.netlist.provenance
+    packing = Packing(planes=chosen["planes"], groups=chosen["scale_groups"])
+    assert packing.planes == 2
+    typed = compile_network(network, replace(options, storage=Fixed((packing,))))
+    for name in FILE.arrays:
+        assert_array_equal(getattr(typed.netlist, name), getattr(found.netlist, name))
 
 
 def test_storage_that_the_chip_does_not_hold_is_not_chosen():

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -101,18 +101,27 @@ class Compilation:
 
 @step("runs the float network on training recordings, where there are any", keeps="the network")
 def _calibrate(done: Compilation) -> Compilation:
-    storage = done.options.storage
     events = done.options.training_events
     if events is None:
         return done
-    if not (isinstance(storage, Exact) or done.options.prune_unused):
-        several = isinstance(storage, Fixed) and any(packing.planes > 1 for packing in storage.packings)
-        # of one plane the same, whether the width was given or found on the others
-        few = held_out.split(len(events))[0]
-        many = calibration.evenly_spaced(np.arange(len(events)), calibration.MANY)
-        events = events[many if several else few]
-    calibrated = calibration.calibrate(done.network, channels_last(events, done.network.input.clocks))
-    return replace(done, calibration=calibrated, rates=calibrated.rates)
+    storage = done.options.storage
+    few = held_out.split(len(events))[0]
+    known = _spikes(done.network, events if isinstance(storage, Exact) else events[few])
+    rates = known.rates
+    if isinstance(storage, Fixed) and any(packing.planes > 1 for packing in storage.packings):
+        known = _for_planes(done.network, events)
+    return replace(done, calibration=known, rates=rates)
+
+
+def _spikes(network: Network, events: AnyArray) -> Calibration:
+    """Run the float network on recordings (samples, taxels, polarities, steps)."""
+    return calibration.calibrate(network, channels_last(events, network.input.clocks))
+
+
+def _for_planes(network: Network, events: AnyArray) -> Calibration:
+    """The same on those that choose several planes, whether these are asked for or found on those held out."""
+    several = held_out.split(len(events))[1]
+    return _spikes(network, events[calibration.evenly_spaced(several, calibration.MANY)])
 
 
 @step(
@@ -125,8 +134,9 @@ def _disconnect(done: Compilation) -> Compilation:
     if done.options.keep_all or isinstance(done.options.storage, Given):
         return replace(done, connected=done.network, quiet=quiet)
     gone = proven = prune.never_fires(done.network)
-    if done.options.prune_unused and done.calibration is not None:
-        gone = prune.either(proven, prune.never_fired(done.network, done.calibration))
+    events = done.options.training_events
+    if done.options.prune_unused and events is not None:
+        gone = prune.either(proven, prune.never_fired(done.network, _spikes(done.network, events)))
         quiet = tuple(left & ~silent for left, silent in zip(gone, proven, strict=True))
     return replace(done, connected=prune.disconnect(done.network, gone), quiet=quiet)
 
@@ -291,19 +301,13 @@ def _with_cheapest(work: Compilation, storage: Cheapest, events: AnyArray) -> Co
     network = work.network
     few = work.calibration
     assert few is not None, "there are recordings"
-    _, several, left_out = held_out.split(len(events))
-
-    @cache
-    def many() -> Calibration:
-        some = events[calibration.evenly_spaced(several, calibration.MANY)]
-        return calibration.calibrate(network, channels_last(some, network.input.clocks))
-
-    judge = HeldOut(network, events[left_out])
+    many = cache(partial(_for_planes, network, events))
+    judge = HeldOut(network, events[held_out.split(len(events))[2]])
     best = work
     most = -1
     trials = list[Trial]()
     for packing in cheapest_first(work.target):
-        known = many() if packing.planes > 1 or work.options.prune_unused else few
+        known = many() if packing.planes > 1 else few
         trial = Trial(planes=packing.planes, groups=packing.groups)
         try:
             tried = run((_quantize, *INTEGERS, *LAYOUT), replace(work, packing=packing, calibration=known))
