@@ -4,6 +4,8 @@ import json
 import os
 import sys
 
+from spikeloom.compiler.errors import OptionError
+
 FORM = "SPIKELOOM_PROGRESS"
 """Variable of the environment, so that processes that a work starts know it, too; ``--progress`` sets it."""
 
@@ -13,6 +15,12 @@ LINES = "json"
 def lines_wanted() -> bool:
     """Whether progress is for a program."""
     return os.environ.get(FORM) == LINES
+
+
+def require_form() -> None:
+    """Refuse another form than that; an OptionError."""
+    if (form := os.environ.get(FORM, "")) not in ("", LINES):
+        raise OptionError(f"{FORM}={form}: no form of progress; allowed is {LINES}, or unset it")
 
 
 def say(label: str, **numbers: float | None) -> None:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import CapacityError, OptionError, SpikeloomError, UnfinishedError
 from spikeloom.compiler.files import WRITTEN
-from spikeloom.models.progress import FORM
+from spikeloom.models.progress import FORM, require_form
 
 if TYPE_CHECKING:
     from spikeloom.runtime.report.sections import Outcome
@@ -206,6 +206,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             write_config(arguments.write_config, arguments.config_table, request)
         if arguments.progress is not None:
             os.environ[FORM] = arguments.progress
+        require_form()
         outcome: Outcome = arguments.action(request)
         text = (
             json.dumps(encode(outcome.result))

@@ -40,7 +40,7 @@ COMMON: dict[str, archive.Kind] = {
 """Entries of every manifest."""
 
 
-ORIGIN = ("data", "train_sha256", "bin_s", "window", "steps")
+ORIGIN = ("data", "train_sha256", "calibrated_sha256", "bin_s", "window", "steps")
 """What a netlist remembers of the recordings behind a network, beside names and places."""
 
 
@@ -53,8 +53,9 @@ def names_of(training: Mapping[str, Any] | None, classes: int) -> list[str] | No
 def origin_of(training: Mapping[str, Any] | None) -> JsonObject:
     """What a netlist remembers of the recordings behind a network.
 
-    Their name and hash, their bins if they were events, per cent of each or steps that trained it if not all did, where
-    the taxels were and how classes are called, if that was said; no value that a netlist may not have.
+    Their name and hash, the hash of others that chose its storage, their bins if they were events, per cent of each or
+    steps that trained it if not all did, where the taxels were and how classes are called, if that was said; no value
+    that a netlist may not have.
     """
     said = training or {}
     usable = [name for name in ORIGIN if not archive.entry_faults(said, {name: PROVENANCE[name]})]
@@ -76,6 +77,7 @@ PROVENANCE: dict[str, archive.Kind] = {
             "spikeloom",
             "checkpoint_sha256",
             "train_sha256",
+            "calibrated_sha256",
             "format",
             "graph",
             "weights",

@@ -27,6 +27,16 @@ def field_of(name: str, field: str) -> str | None:
     return None if match is None else match[1]
 
 
+def fields_in(name: str) -> list[str]:
+    """Fields of a file name, as a name that keeps them has them.
+
+    >>> fields_in("texture00_speed3600_force=0.5_label_3.npz"), fields_in("grasp_3_label_1.csv")
+    (['texture00', 'speed3600', 'force=0.5'], [])
+    """
+    parts = re.split("[_-]", PurePath(name).stem)
+    return [part for part in parts if re.fullmatch(r"[A-Za-z]+(=[A-Za-z0-9.]+|[0-9][0-9.]*)", part)]
+
+
 def groups_of(
     source: str, files: Sequence[str], rows: Sequence[dict[str, str]], wanted: Sequence[str] | None
 ) -> dict[str, tuple[str, ...]]:
@@ -49,6 +59,16 @@ def groups_of(
             )
         groups[group] = tuple(map(str, values))
     return groups
+
+
+def group_notes(source: str, rows: Sequence[dict[str, str]]) -> list[str]:
+    """Columns of a table that only some recordings have a value in."""
+    notes = []
+    for name in dict.fromkeys(name for row in rows for name in row):
+        without = sum(not row.get(name) for row in rows)
+        if 0 < without < len(rows):
+            notes.append(f"{source}: {without} of {len(rows)} recordings have no {name}: no condition")
+    return notes
 
 
 def conditions(data: Recordings) -> dict[str, dict[str, BoolArray]]:

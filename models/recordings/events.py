@@ -21,21 +21,27 @@ from spikeloom.compiler.types import AnyArray, EventArray, IntArray
 from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.arrays import Binned, bins_joined, one_width, read_binned
 from spikeloom.models.recordings.classes import numbered
-from spikeloom.models.recordings.conditions import groups_of
+from spikeloom.models.recordings.conditions import group_notes, groups_of
 from spikeloom.models.recordings.counts import GAP_S, EventCounts
 from spikeloom.models.recordings.csvtable import NOTHING, Row, is_table, rows_beside
 from spikeloom.models.recordings.eventfiles import EventStream, read_stream
 from spikeloom.models.recordings.evtouch import BIN_S
 from spikeloom.models.recordings.fetch import DATA_SETS, find_data
-from spikeloom.models.recordings.single import Single, silent_notes, taxel_notes, unit_notes, width_notes
+from spikeloom.models.recordings.single import (
+    SEVERAL,
+    Single,
+    length_notes,
+    polarity_notes,
+    silent_notes,
+    taxel_notes,
+    unit_notes,
+    width_notes,
+)
 
 MAX_STEPS = 1_000_000
 
 UNIT_SPAN_S = 60.0
 """Up to this length of a recording no unit is doubted."""
-
-SEVERAL = 8
-"""Recordings from which on a taxel without any event tells something."""
 
 # Times typed in decimals fall on edges, and 0.58 / 0.02 is 28.999999999999996. Of a bin; three roundings of
 # a quotient below MAX_STEPS are off by a third of it at most.
@@ -108,6 +114,8 @@ def load_data(
     notes = [*table.notes, *silent_notes(read, source), *unit_notes(read)]
     notes += width_notes(read, [name for name, _ in chosen], source)
     notes += taxel_notes(source, events) if taxels is None else []
+    notes += [*length_notes(source, events, steps), *polarity_notes(read, source, events)]
+    notes += group_notes(source, [row.groups for row in rows]) if groups is None else []
     return evtouch.Recordings(
         events=events,
         labels=labels,
@@ -250,11 +258,15 @@ def bin_events(
     """
     latest = int(np.argmax(stream.time_s))
     last = float(stream.time_s[latest])
-    # A sensor that is touched sends several events a second: fewer than one, for a minute, are in a smaller
-    # unit.
-    odd = last > UNIT_SPAN_S and len(np.unique(stream.time_s)) < last - stream.time_s.min()
+    first = float(stream.time_s.min())
+    moments = len(np.unique(stream.time_s)) if last > UNIT_SPAN_S else 0
+    note = time_note(first, last, moments)
     if last / bin_s >= MAX_STEPS:
-        remedy = "write seconds" if odd else "count from the start of the recording or use wider bins"
+        remedy = (
+            "write seconds"
+            if note.endswith("seconds")
+            else "count from the start of the recording or use wider bins"
+        )
         raise DataError(
             f"{stream.at(latest)}: time {last:g} s is past {MAX_STEPS} bins of {bin_s:g} s, the limit of a recording; "
             f"{remedy}"
@@ -266,12 +278,6 @@ def bin_events(
     grid = np.zeros((n, 2, steps), dtype=np.uint8)
     grid[stream.taxel, stream.polarity, step] = 1
     sent = len(stream.time_s)
-    first = float(stream.time_s.min())
-    note = ""
-    if odd:
-        note = f"times up to {last:g} s with less than an event a second; write seconds"
-    elif first > max(last - first, 10 * GAP_S):
-        note = f"events begin at {first:g} s; count times from the start of the recording"
     return grid, EventCounts(
         events=sent,
         out_of_order=int(np.count_nonzero(stream.time_s < np.maximum.accumulate(stream.time_s))),
@@ -279,6 +285,23 @@ def bin_events(
         gaps=int(np.count_nonzero(np.diff(np.sort(stream.time_s)) > GAP_S)),
         notes=(note,) if note else (),
     )
+
+
+def time_note(first: float, last: float, moments: int) -> str:
+    """Why the times of a recording look wrong: its first and last, of so many different ones; or nothing.
+
+    A sensor that is touched sends several events a second: fewer than one, for a minute, are in a smaller unit.
+
+    >>> time_note(0, 2000, 40), time_note(0, 2, 40)
+    ('times up to 2000 s with less than an event a second; write seconds', '')
+    >>> time_note(90, 95, 200)
+    'events begin at 90 s; count times from the start of the recording'
+    """
+    if last > UNIT_SPAN_S and moments < last - first:
+        return f"times up to {last:g} s with less than an event a second; write seconds"
+    if first > max(last - first, 10 * GAP_S):
+        return f"events begin at {first:g} s; count times from the start of the recording"
+    return ""
 
 
 def joined_bins(recordings: evtouch.Recordings, bins: int) -> evtouch.Recordings:
@@ -432,7 +455,7 @@ def _from_events(
             raise DataError(
                 f"{where}: an event at {last:g} s, its table says {duration_s:g} s; fix one of them"
             )
-    return Single(where, grid, stream.label, counts, steps, bin_s)
+    return Single(where, grid, stream.label, counts, steps, bin_s, sent=True)
 
 
 def _steps(duration_s: float, bin_s: float, where: str) -> int:

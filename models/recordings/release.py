@@ -1,6 +1,7 @@
 """Write recordings in the released layout: ``SPLIT/sample_N_label_L.npy``, float32 (taxels, 2, steps).
 
-Each is as long as it was. A table beside the splits says which file each of them was.
+Each is as long as it was. A table beside the splits says which file each of them was. Conditions stay: fields of its
+name behind the label, columns of a table in a table.
 """
 
 import csv
@@ -17,6 +18,8 @@ from spikeloom.compiler.archive import ZIP_DATE, npy_bytes
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import beside, write_atomically
 from spikeloom.models.recordings.classes import class_in_name
+from spikeloom.models.recordings.conditions import fields_in
+from spikeloom.models.recordings.csvtable import TABLES
 from spikeloom.models.recordings.events import need_labels
 from spikeloom.models.recordings.evtouch import WIDTH, Recordings, require_polarities
 
@@ -78,6 +81,16 @@ def _members(splits: Sequence[Recordings], bin_s: float | None) -> Iterator[tupl
             name = recordings.class_name(int(recordings.labels[index]))
             writer.writerow([*row, *([_no_formula(name)] if named else [])])
     yield SOURCES, text.getvalue().encode()
+    groups = [name for name in splits[0].groups if all(name in each.groups for each in splits)]
+    if groups:
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(["file", *groups])
+        for recordings in splits:
+            for index in range(len(recordings)):
+                file = f"{recordings.split}/{_name(recordings, index)}"
+                writer.writerow([file, *(_no_formula(recordings.groups[name][index]) for name in groups)])
+        yield TABLES[0], text.getvalue().encode()
     if bin_s is not None:
         yield WIDTH, npy_bytes(np.array([bin_s]))
 
@@ -91,7 +104,9 @@ def _name(recordings: Recordings, index: int) -> str:
     width = len(str(len(recordings) - 1))
     label = int(recordings.labels[index])
     safe = all(class_in_name(f"_label_{name}.npy") == name for name in recordings.names or ())
-    return f"sample_{index:0{width}}_label_{recordings.class_name(label) if safe else label}.npy"
+    kind = recordings.class_name(label) if safe else label
+    fields = fields_in(recordings.files[index])
+    return f"{'_'.join([f'sample_{index:0{width}}_label_{kind}', *fields])}.npy"
 
 
 def write_event_lines(path: str | os.PathLike[str], splits: Sequence[Recordings], bin_s: float) -> None:

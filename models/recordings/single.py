@@ -6,9 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.types import EventArray
+from spikeloom.compiler.types import EventArray, IntArray
 from spikeloom.models.recordings.counts import EventCounts, number
 from spikeloom.models.recordings.evtouch import BIN_S, WIDTH
+
+SEVERAL = 8
+"""Recordings from which on what none of them has tells something."""
+
+SILENT = 10
+"""A recording this many times as long as its events was hardly meant."""
 
 _RELEASED = re.compile(r"sample_[0-9]+_label_")
 
@@ -24,6 +30,7 @@ class Single:
     steps: int  # Its length; 0 where it has no events, and nothing says how long it is
     bin_s: float | None  # Seconds of a bin, where somebody said so
     assumed: bool = False  # Whether an array does not say it
+    sent: bool = False  # Whether it came as events
 
 
 def unit_notes(read: Sequence[Single]) -> list[str]:
@@ -49,6 +56,23 @@ def width_notes(read: Sequence[Single], names: Sequence[str], source: str) -> li
     ]
     line = f"{source}: nothing says how long a bin of its arrays is: {BIN_S:g} s is assumed"
     return [f"{line}; write the seconds to {WIDTH} beside them"] if guessed else []
+
+
+def length_notes(source: str, events: EventArray, steps: IntArray) -> list[str]:
+    """Lengths (samples,) in a smaller unit leave nearly all of every recording silent."""
+    busy = events.any(axis=(1, 2))
+    ends = np.where(busy, np.arange(1, busy.shape[1] + 1), 0).max(axis=1)
+    if (SILENT * ends >= steps).any():
+        return []
+    return [f"{source}: no event after a tenth of each recording: are the lengths right, in seconds?"]
+
+
+def polarity_notes(read: Sequence[Single], source: str, events: EventArray) -> list[str]:
+    """A polarity that nothing has among several recordings that came as events."""
+    none = np.flatnonzero(~events.any(axis=(0, 1, 3)))
+    if len(read) < SEVERAL or not all(each.sent for each in read) or not len(none):
+        return []
+    return [f"{source}: no event of polarity {none[0]} in {number(len(read), 'recording')}"]
 
 
 def taxel_notes(source: str, events: EventArray) -> list[str]:

@@ -21,10 +21,13 @@ STORED = ("weight_bits", "planes", "scale_groups", "spike_exact", "keep")
 def provenance(
     request: CompileRequest, asked: LoadedNetwork, *, calibrated: Recordings | None
 ) -> Mapping[str, Any]:
-    """What a netlist remembers of its compilation, whose scales the recordings `calibrated` chose, if any did."""
+    """What a netlist remembers of its compilation, with scales by the recordings `calibrated`, in their own bins."""
     seen: JsonObject = {}
     if calibrated is not None:
         seen = {"data": calibrated.source, "bin_s": calibrated.bin_s, "class_names": calibrated.names}
+    origin = origin_of(asked.training) or origin_of(seen)
+    if calibrated is not None and calibrated.events_sha256 != origin.get("train_sha256"):
+        origin["calibrated_sha256"] = calibrated.events_sha256
     checkpoint = asked.checkpoint
     cores_for = parse_cores(request.cores_for)
     places = given_places(request.taxels)
@@ -32,7 +35,7 @@ def provenance(
         "spikeloom": __version__,
         "checkpoint_sha256": asked.sha256,
         **asked.origin(request.run),
-        **(origin_of(asked.training) or origin_of(seen)),
+        **origin,
         **({"positions_mm": places} if places else {}),
         **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
         **remembered(storage_of(request, asked.network.forms)),
@@ -118,12 +121,16 @@ def _packings(request: CompileRequest) -> tuple[Packing, ...] | None:
 
     Raises OptionError if they are no numbers, or disagree about the number of layers.
     """
-    if not (request.weight_bits or request.planes or request.scale_groups):
+    said = {
+        "--weight-bits": (request.weight_bits, "8"),
+        "--planes": (request.planes, "1"),
+        "--scale-groups": (request.scale_groups, "1"),
+    }
+    if all(words is None for words, _ in said.values()):
         return None
     numbers = {
-        "--weight-bits": whole_numbers(request.weight_bits or "8", "--weight-bits"),
-        "--planes": whole_numbers(request.planes or "1", "--planes"),
-        "--scale-groups": whole_numbers(request.scale_groups or "1", "--scale-groups"),
+        option: whole_numbers(usual if words is None else words, option)
+        for option, (words, usual) in said.items()
     }
     layers = max(len(values) for values in numbers.values())
     for option, values in numbers.items():

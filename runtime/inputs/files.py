@@ -10,7 +10,7 @@ from pathlib import Path
 from spikeloom.compiler.archive import stated
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import beside, remove_leftovers, write_atomically
-from spikeloom.compiler.formats import NETWORKS, NIR, ONNX
+from spikeloom.compiler.formats import NETWORKS, NETX, NIR, ONNX
 from spikeloom.models.recordings.classes import class_in_name
 from spikeloom.runtime.report.drawing import Drawing
 from spikeloom.runtime.requests.fields import Request
@@ -156,7 +156,7 @@ def require_inspectable(path: str) -> None:
 
     Raises OptionError if it is a folder, or a zip or npz of something else.
     """
-    if path.endswith((ONNX, NIR)):
+    if path.endswith((ONNX, NIR, NETX)):
         require_netlist(path)
     if Path(path).is_dir():
         raise OptionError(f"{path}: is a folder, not a netlist or a checkpoint; {_RECORDINGS}")

@@ -209,7 +209,7 @@ def _require_fit(path: str, reader: Reader, request: NetworkChoice) -> None:
     """Refuse options that are for another format, and files that hold no float network."""
     if path.endswith(NETX):
         raise OptionError(
-            f"{path}: holds integers, no float network to compare with; compile, inspect and run it"
+            f"{path}: holds integers, no float network to compare with; compile it, then inspect and run the netlist"
         )
     if reader is CHECKPOINT and is_hdf5(path):
         raise ModelError(f"{path}: is an HDF5 file, as NIR files are; let its name end in {NIR}")

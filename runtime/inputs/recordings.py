@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,9 @@ from spikeloom.models.recordings.evtouch import (
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
 from spikeloom.runtime.report.console import progress, tell
 from spikeloom.runtime.requests.choices import SplitChoice
+
+FEW_STEPS = 10
+"""A recording of fewer was hardly meant."""
 
 
 def recordings(
@@ -61,6 +64,8 @@ def recordings(
         require_suited(given, classes=classes, taxels=taxels)
         _require_width(given, trained_bin, f"read them with recordings(…, bin={trained_bin})")
         data = first_part(with_groups(_first(given, limit), wanted), (trained or {}).get("window", WHOLE))
+        _warn_of_training(data, trained or {})
+        warn_of_few(data, bins)
         return events.joined_bins(data if labels_for is None else events.need_labels(data, labels_for), bins)
     if path != SYNTHETIC:
         _require_asked(bin_s, trained_bin)
@@ -90,11 +95,14 @@ def recordings(
         _require_width(data, trained_bin, "give recordings in such bins")
     if classes is not None:
         _warn_of_others(data, trained or {}, classes, whole=limit is None)
+        if split == "train" and limit is None:
+            warn_of_missing(data, range(classes))
     elif labels_for is not None:
         (data,) = without_gaps(data)
     data = first_part(data, (trained or {}).get("window", WHOLE))
     _warn_of_training(data, trained or {})
     _warn_of_steps(data, trained or {})
+    warn_of_few(data, bins)
     return events.joined_bins(data, bins)
 
 
@@ -139,7 +147,7 @@ def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int, 
         )
     name = trained.get("data", data.source)
     known = int(data.labels.max(initial=UNLABELLED))
-    fewer = whole and len(data) >= classes and UNLABELLED < known < classes - 1
+    fewer = whole and data.split != "train" and len(data) >= classes and UNLABELLED < known < classes - 1
     named = bool(data.names) and "class_names" in trained  # each of them is a class of the network
     # splits of synthetic ones differ in their seed
     same = named or name.partition(", seed")[0] == data.source.partition(", seed")[0]
@@ -163,12 +171,13 @@ def _warn_of_steps(data: Recordings, trained: Mapping[str, Any]) -> None:
 
 def _warn_of_training(data: Recordings, trained: Mapping[str, Any]) -> None:
     """Say on stderr that what stands for new recordings is what trained the network."""
-    known = trained.get("train_sha256")
-    if known is not None and data.split != "train" and data.events_sha256 == known:
-        tell(
-            f"warning: {data.source}: these are the {number(len(data), 'recording')} that trained the network; what is "
-            "reached on them says nothing of others"
-        )
+    did = {"train_sha256": "trained the network", "calibrated_sha256": "chose the network's storage"}
+    for name in did.keys() & trained.keys() if data.split != "train" else ():
+        if data.events_sha256 == trained[name]:
+            tell(
+                f"warning: {data.source}: these are the {number(len(data), 'recording')} that {did[name]}; what is "
+                "reached on them says nothing of others"
+            )
 
 
 def require_splits(path: str | Recordings) -> None:
@@ -192,6 +201,23 @@ def warn_of_shared(training: Recordings, test: Recordings) -> None:
         tell(
             f"warning: {test.source}: {count} of {len(test)} test recordings are training recordings, too; what is "
             "reached on these says nothing of others"
+        )
+
+
+def warn_of_missing(training: Recordings, wanted: Iterable[int]) -> None:
+    """Say on stderr of which classes that are wanted there is no training recording, where all are labelled."""
+    seen = set(training.labels.tolist())
+    if UNLABELLED not in seen and (missing := sorted(set(wanted) - seen)):
+        named = listed([*map(training.class_name, missing)])
+        tell(f"warning: {training.source}: no training recordings of class {named}")
+
+
+def warn_of_few(data: Recordings, bins: int = 1) -> None:
+    """Say on stderr that recordings have hardly a step, of so many bins: their times are of another unit, or bins."""
+    if (steps := -(-data.steps // bins)) < FEW_STEPS:
+        tell(
+            f"warning: {data.source}: {number(steps, 'step')} of {bins * data.seconds:g} s in the longest recording; "
+            "are its times seconds, and are steps so long?"
         )
 
 

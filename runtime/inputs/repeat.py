@@ -7,7 +7,7 @@ from typing import Any
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.targets import DEFAULT_TARGET
 from spikeloom.compiler.types import JsonObject
-from spikeloom.runtime.requests.fields import Request
+from spikeloom.runtime.requests.fields import Request, has_default
 
 NETWORK = ("graph", "taxels", "edges", "directed", "run", "weights", "beta", "theta")
 """Options that say how a checkpoint is read."""
@@ -74,8 +74,10 @@ def typed(request: Request, names: Sequence[str]) -> list[str]:
 
 def refuse(request: Request, names: Sequence[str], why: str) -> None:
     """Refuse options that are given although they do not apply; OptionError naming the first of them."""
+    usual = {each.name: each.default for each in request.options() if has_default(each)}
     for name in names:
-        if line := typed(request, [name]):
+        line = typed(request, [name])
+        if line and getattr(request, name) != usual.get(name):
             raise OptionError(f"{' '.join(line)}: {why}; omit it")
 
 

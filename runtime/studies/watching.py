@@ -21,6 +21,7 @@ from decimal import Decimal
 from spikeloom.compiler.types import EventArray, IntArray, JsonObject
 from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.eventlines import Event, EventLines, Mark
+from spikeloom.models.recordings.events import time_note
 from spikeloom.runtime.machines.base import Step, Stream
 from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.encode import OPTIONAL
@@ -69,6 +70,8 @@ class Watch:
     last: tuple[Step, ...] = ()
     shown: int | None = None  # Decision that was printed last
     found: Summary = field(default_factory=Summary)
+    times: tuple[Decimal, Decimal, int] | None = None  # First and last of the grasp, and how many there are
+    noted: bool = False  # Whether it was said that times look wrong
 
     def run(self) -> None:
         """Follow the lines to their end, or until the user, or the reader of our output, ends it before."""
@@ -105,6 +108,9 @@ class Watch:
         if self.origin is None:
             self.origin = event.time_s if self.from_first else Decimal(0)
             self.epoch = time.monotonic() - float(event.time_s - self.origin)
+        first, last, moments = self.times or (event.time_s, event.time_s, 1)
+        moments += event.time_s != last
+        self.times = min(first, event.time_s), max(last, event.time_s), moments
         place = (event.time_s - self.origin) / self.bin_s + EDGE
         index = int(place) if place >= 0 else -1
         if self._is_open() and index - self.stream.index > MAX_GAP:
@@ -152,8 +158,19 @@ class Watch:
         if self._is_open():
             self._decide()
         self.stream.reset()
+        self._note_times()
         self.origin = None
         self.decided = False
+
+    def _note_times(self) -> None:
+        """Say once what recordings with such times would be told."""
+        if self.times is not None and not self.noted:
+            first, last, moments = self.times
+            start = self.origin if self.from_first and self.origin is not None else Decimal(0)
+            if note := time_note(float(first - start), float(last - start), moments):
+                tell(f"warning: grasp {self.found.grasps}: {note}")
+                self.noted = True
+        self.times = None
 
     def _decide(self, *, early: bool = False) -> None:
         """Run the steps by which the read-out lags, unless they change nothing, and show the decision."""

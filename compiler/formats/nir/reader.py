@@ -147,7 +147,9 @@ def _sensor(
         raise ModelError(f"has {channels} clocks in an input of shape {list(shape)}; {AGAIN}")
     sensed = (shape[0] - channels,) if channels else shape
     sensor, positions, words = sensor_layout(
-        sensed, polarities=polarities or said["polarities"], polarities_first=first
+        sensed,
+        polarities=said["polarities"] if polarities is None else polarities,
+        polarities_first=first,
     )
     clocks = Clocks(channels=channels, steps=said["clock_steps"] or 1, length=said["length"])
     positions = np.append(positions, np.arange(sensor.size, sensor.size + channels))

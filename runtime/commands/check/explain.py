@@ -44,7 +44,9 @@ def run(request: ExplainRequest) -> Outcome:
         request = replace(request, limit=LIMIT)
     data = load_recordings(request.data, request, netlist)
     chosen = (
-        range(len(data)) if request.sample is None else [find_recording(data, request.sample, "--sample")]
+        range(len(data))
+        if request.sample is None
+        else [find_recording(data, request.sample, "--sample/--recording")]
     )
 
     machine.require_windows()

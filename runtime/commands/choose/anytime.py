@@ -4,8 +4,9 @@ from dataclasses import replace
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.types import FloatArray
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.recordings import load_recordings
+from spikeloom.runtime.inputs.recordings import in_steps, load_recordings, warn_of_shared
 from spikeloom.runtime.machines.backends import machine_for
 from spikeloom.runtime.machines.capabilities import Stoppable
 from spikeloom.runtime.report.console import progress
@@ -36,7 +37,7 @@ def run(request: AnytimeRequest) -> Outcome:
     allowed = _allowed(request)
     machine = Stoppable.required(machine_for(request.netlist), request.netlist, "anytime")
     data = load_recordings(request.data, request, machine.netlist)
-    points = _races(request, machine)
+    points = _races(request, machine, data)
     progress("running")
     ran = machine.cumulative(data.events, data.step_counts)
     result = study(
@@ -69,13 +70,17 @@ def _allowed(request: AnytimeRequest) -> list[float]:
     return [chosen, *(share for share in ALLOWED if share != chosen)]
 
 
-def _races(request: AnytimeRequest, machine: Stoppable) -> FloatArray | None:
+def _races(request: AnytimeRequest, machine: Stoppable, data: Recordings) -> FloatArray | None:
     """Turning points of races or decisions of the training split, if there is something to calibrate on."""
     if request.calibrate is None:
         return None
-    training = load_recordings(
-        request.calibrate, replace(request, split="train", limit=None), machine.netlist
-    )
+    whole = replace(request, split="train", limit=None)
+    calibrating = load_recordings(request.calibrate, whole, machine.netlist, joined=False)
+    known = machine.netlist.provenance.get("train_sha256")
+    if request.held_out and calibrating.events_sha256 == known:
+        raise OptionError(f"--held-out: {request.calibrate} trained the network; omit it, or give others")
+    training = in_steps(calibrating, machine.netlist)
+    warn_of_shared(training, data)
     progress("calibrating")
     lengths = training.step_counts
     race = exits.standing if request.held_out else exits.races

@@ -15,7 +15,7 @@ from spikeloom.models.recordings.release import SOURCES, write_event_lines, writ
 from spikeloom.models.sensors import read_layout
 from spikeloom.runtime.commands.options import add_common, add_options
 from spikeloom.runtime.inputs.files import require_place
-from spikeloom.runtime.inputs.recordings import require_bins
+from spikeloom.runtime.inputs.recordings import require_bins, warn_of_few
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.requests.exchange import ConvertRequest, DescribeRequest, FetchRequest
 from spikeloom.runtime.requests.fields import Request
@@ -59,6 +59,7 @@ def _describe(request: DescribeRequest) -> Outcome:
     recordings = _load(request.source, request.split, request.bin, count)
     require_polarities(recordings)
     show_notes(recordings.counts)
+    warn_of_few(recordings)
     return Outcome(describe(recordings), described_sections)
 
 
@@ -74,6 +75,7 @@ def _convert(request: ConvertRequest) -> Outcome:
     ]
     for recordings in loaded:
         show_notes(recordings.counts)
+        warn_of_few(recordings, bins)
     loaded = [joined_bins(recordings, bins) for recordings in loaded]
     taxels = max(recordings.taxels for recordings in loaded)
     steps = max(recordings.steps for recordings in loaded)

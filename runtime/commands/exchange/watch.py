@@ -32,9 +32,9 @@ def run(request: WatchRequest) -> Outcome:
     """Run the command; its result is the summary, everything else was printed before."""
     from spikeloom.runtime.machines.backends import machine_for
 
-    _require_length(request)
     machine = machine_for(request.netlist)
     netlist = machine.netlist
+    bins = _bins(request, netlist)
     if netlist.polarities != 2:
         raise ModelError(
             f"{request.netlist}: {netlist.polarities} polarities per taxel found, event lines have 2; "
@@ -50,10 +50,10 @@ def run(request: WatchRequest) -> Outcome:
             as_json=request.json,
             column=np.zeros(netlist.taxels * netlist.polarities, np.uint8),
             bin_s=step_s,
-            bins=_bins(request, netlist),
+            bins=bins,
             from_first=request.origin == "first",
             real=request.speed == "real",
-            may_end=_ending(request, machine),
+            may_end=_ending(request, machine, bins),
             found=Summary(early=early),
             names=names_of(netlist.provenance, netlist.classes),
         )
@@ -63,14 +63,11 @@ def run(request: WatchRequest) -> Outcome:
     return Outcome(session.found, sections)
 
 
-def _require_length(request: WatchRequest) -> None:
-    """Refuse a length of a grasp that is none, and an early end without one."""
-    if request.bins is not None and request.bins < 1:
-        raise OptionError(f"--bins {request.bins}: not a length; give 1 or more, or omit it")
-    factor = request.until_sure
+def _require_sure(factor: float | None, bins: int | None) -> None:
+    """Refuse an early end without a length, and a factor that is none."""
     if factor is None:
         return
-    if request.bins is None:
+    if bins is None:
         raise OptionError(
             "--until-sure: what can still come is not known; give the length of a grasp with --bins"
         )
@@ -82,7 +79,9 @@ def _require_length(request: WatchRequest) -> None:
 
 
 def _bins(request: WatchRequest, netlist: Netlist) -> int | None:
-    """Bins of every grasp, where their number is fixed."""
+    """Bins of every grasp, where their number is fixed; refused where that is none, or an early end needs it."""
+    if request.bins is not None and request.bins < 1:
+        raise OptionError(f"--bins {request.bins}: not a length; give 1 or more, or omit it")
     length = netlist.clocks.length
     bins = request.bins or length
     if length and bins != length:
@@ -90,6 +89,7 @@ def _bins(request: WatchRequest, netlist: Netlist) -> int | None:
             f"--bins {bins}: the network runs every grasp for {length} steps, the last of them its read-out; "
             f"give --bins {length} or omit it"
         )
+    _require_sure(request.until_sure, bins)
     return bins
 
 
@@ -104,16 +104,16 @@ def _step_seconds(request: WatchRequest, netlist: Netlist) -> Decimal:
     return netlist.bins * (bin_s or Decimal(str(trained or BIN_S)))
 
 
-def _ending(request: WatchRequest, machine: Machine) -> Callable[[int, IntArray], bool] | None:
+def _ending(
+    request: WatchRequest, machine: Machine, bins: int | None
+) -> Callable[[int, IntArray], bool] | None:
     """Says whether a grasp is decided before its end, where that is wanted."""
     from spikeloom.runtime.machines.capabilities import Stoppable
     from spikeloom.runtime.studies.anytime import exits
 
-    if request.until_sure is None or request.bins is None:
+    if request.until_sure is None or bins is None:
         return None
-    return exits.live(
-        Stoppable.required(machine, request.netlist, "--until-sure"), request.bins, request.until_sure
-    )
+    return exits.live(Stoppable.required(machine, request.netlist, "--until-sure"), bins, request.until_sure)
 
 
 def _opened(name: str) -> io.FileIO:

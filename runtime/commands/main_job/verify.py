@@ -22,7 +22,17 @@ Without --data nothing is simulated: only the level EN is asked, whether the net
 always required.
 """
 
-WITH_DATA = ("original", "min_agreement", "require", "limit")
+WITH_DATA = (
+    "original",
+    "engine",
+    "min_agreement",
+    "require",
+    "spec_samples",
+    "bin",
+    "split",
+    "limit",
+    "window",
+)
 """Options that only say something about recordings."""
 
 

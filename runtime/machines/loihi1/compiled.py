@@ -133,6 +133,11 @@ def _tried(facts: CompilationFacts) -> Iterator[Block]:
         kept = [f"{trial.equal} of {trial.decisions}", *costs]
         rows.append([name, *(["does not fit", "", "", ""] if trial.refused else kept)])
     chosen = rows[max(range(len(rows)), key=lambda row: facts.trials[row].equal)][0]
+    if not any(trial.decisions for trial in facts.trials):
+        yield Text(
+            f"storage: {chosen}, untested: the float model decides no thinned, held-out training recording"
+        )
+        return
     why = "the cheapest that keeps" if _holds(facts.trials, facts.keep) else "which keeps most; none keeps"
     yield Text(
         f"storage: {chosen}, {why} {100 * facts.keep:g} % of the decisions of quarters of thinned, held-out training "

@@ -8,6 +8,7 @@ from spikeloom.compiler import __version__
 from spikeloom.compiler.formats import NETX
 from spikeloom.compiler.formats.netx.reader import read_netx
 from spikeloom.compiler.interpret import channels_last
+from spikeloom.compiler.ir import Network
 from spikeloom.compiler.storage import Fixed, Storage
 from spikeloom.compiler.targets.loihi1 import integers
 from spikeloom.compiler.targets.loihi1.integers import run_integer
@@ -16,7 +17,7 @@ from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import Compilation, compile_network
 from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import BoolArray, EventArray
-from spikeloom.models.recordings.events import of_length
+from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.compilation import parse_cores, provenance, storage_of
 from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
@@ -38,14 +39,16 @@ def lower(request: CompileRequest, after: Callable[[str, Any], object]) -> Lower
     path = request.checkpoint
     if isinstance(path, str) and path.endswith(NETX):
         return _lower_integers(path, request)
+    if request.calibrate is None:
+        refuse(request, ("share_lists", "bin"), "is about recordings, give --calibrate too")
     said = _options(request, storage_of(request))
     said.require_consistent(calibrated=request.calibrate is not None)
     loaded = load_network(path, request)
     forms = loaded.network.forms
     if forms is not None:
-        refuse(request, ("keep",), f"{path} was fine-tuned for its own storage")
+        refuse(request, ("keep", "share_lists"), f"{path} was fine-tuned for its own storage")
     seen = None if request.calibrate is None else _calibration(request.calibrate, request.bin, loaded)
-    training = None if seen is None else of_length(seen, loaded.network.input.clocks.length).events
+    training = None if seen is None else _in_steps(seen, loaded.network)
     progress("compiling")
     options = replace(
         said,
@@ -90,7 +93,7 @@ def _options(request: CompileRequest, storage: Storage) -> Options:
 
 
 def _calibration(source: str | Recordings, bin_s: float | None, loaded: LoadedNetwork) -> Recordings:
-    """Training recordings that choose storage and scales."""
+    """Training recordings that choose storage and scales, in their own bins."""
     progress("reading the recordings")
     return recordings(
         source,
@@ -98,9 +101,13 @@ def _calibration(source: str | Recordings, bin_s: float | None, loaded: LoadedNe
         classes=loaded.network.classes,
         taxels=loaded.network.input.taxels,
         bin_s=bin_s,
-        bins=loaded.network.input.bins,
         trained=origin_of(loaded.training) | step_of(loaded.read_as, loaded.network.input.bins),
     )
+
+
+def _in_steps(data: Recordings, network: Network) -> EventArray:
+    """Their events in steps of a network."""
+    return of_length(joined_bins(data, network.input.bins), network.input.clocks.length).events
 
 
 def _finetune(request: CompileRequest, *, checkpoint: bool) -> str:
@@ -124,7 +131,7 @@ class LaidOut(Shown):
 
 def _lower_integers(path: str, request: CompileRequest) -> Lowered:
     """Lay out a file that brings its integers: nothing is rounded."""
-    floats = ("dt", "convention", *ROUNDING, "dump_after", "calibrate")
+    floats = ("dt", "convention", *ROUNDING, "dump_after", "calibrate", "bin")
     refuse(request, floats, f"is for float networks, {path} holds integers")
     refuse(request, NETWORK, f"is for checkpoints, the netx file {path} holds all it needs")
     progress("reading the network")

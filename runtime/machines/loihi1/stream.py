@@ -34,7 +34,7 @@ class Stream:
     Streams of one engine share nothing that changes: several may take turns, or run in a thread each.
     """
 
-    __slots__ = ("_bounds", "_column", "_ended", "_engine", "_last", "_place", "_state")
+    __slots__ = ("_bounds", "_column", "_ended", "_engine", "_last", "_place", "_state", "_told")
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
@@ -47,6 +47,7 @@ class Stream:
         self._state = start(engine)
         self._ended = False
         self._last: Step | None = None
+        self._told = False  # That events came after the end
         # loads or compiles the kernel now, not within the first bin
         advance(engine, self._state, self._column, length=NO_END, steps=0)
 
@@ -72,8 +73,9 @@ class Stream:
         netlist = self._engine.netlist
         bin_ = _one_bin(netlist, events)
         if self.index == netlist.clocks.length and self._last is not None:
-            if bin_.any():
+            if bin_.any() and not self._told:
                 tell(f"warning: stream: events after the network's {self.index} steps: not used")
+                self._told = True
             return self._last
         self._column[: len(bin_), 0] = bin_
         self._column[len(bin_) :] = netlist.clocks.events(1, first=self.index)

@@ -38,7 +38,7 @@ def lower(request: CompileRequest, after: Callable[[str, Any], object]) -> Lower
     path = request.checkpoint
     if isinstance(path, str) and path.endswith(NETX):
         raise OptionError(f"--target {request.target}: {path} holds integers of another chip; omit it")
-    refuse(request, ("calibrate", *ROUNDING, *PLACING), "is not for truenorth")
+    refuse(request, ("calibrate", "bin", *ROUNDING, *PLACING), "is not for truenorth")
     source: Source | Network
     if isinstance(path, str) and is_trained(shipped(path)):
         trained = read(path, request)

@@ -26,8 +26,13 @@ def sections(result: Anytime) -> list[Section]:
 
 def _lines(result: Anytime) -> list[str]:
     live = f"live: spikeloom watch NET.loom --bins {result.bins} --until-sure"
+    shortest = result.bins - (max(result.chip_steps) - min(result.chip_steps))
+    padded = (
+        f"each recording ends with its own last step here, after {shortest} to {result.bins}; live, all are "
+    )
+    note = [] if shortest == result.bins else [f"{padded}padded to --bins: other figures, perhaps decisions"]
     if result.chosen is None:
-        return [live]
+        return [*note, live]
     rule = result.rules[result.chosen].stop
     assert rule.bound is not None, "a chosen rule is calibrated"
     kind, noun = (
@@ -37,6 +42,7 @@ def _lines(result: Anytime) -> list[str]:
         f"calibrated on {rule.races} {kind} of {result.calibrated_on}, split train: of such {noun} at most "
         f"{100 * rule.bound:.1f} % end otherwise where {_allowed(rule)} did (95 % confidence)"
         + ("" if result.held_out else "; nothing bounds decisions"),
+        *note,
         f"{live} {math.ceil(1e4 * rule.factor) / 1e4:g}",  # a larger one is as safe
     ]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import product
 
 import numpy as np
@@ -58,7 +58,7 @@ def sections(result: Certificates) -> Iterator[Section]:
         yield Section("When single events alter", [Table(head, [["of them", *cells]])])
     fragile = sorted(certificates, key=lambda each: (each.at_least, each.ahead))
     head = ["recording", "label", "decided", "ahead", "at least", "at most", "alters"]
-    rows = [_row(each) for each in fragile]
+    rows = [_row(each, result.class_names) for each in fragile]
     yield Section("The least stable", [Table(head, rows, words=True, most=SHOWN)])
 
 
@@ -80,10 +80,11 @@ def _radii(result: Certificates) -> Table:
     return Table(["changed events", "proven to stand", "shown to fall", "open"], rows)
 
 
-def _row(one: Certificate) -> list[str]:
+def _row(one: Certificate, names: Sequence[str] | None) -> list[str]:
+    called = [each if names is None else names[each] for each in (one.label, one.decision)]
     kinds = [name for name, kind in one.kinds.items() if kind.alter]
     most = "–" if one.at_most is None else str(one.at_most)
-    words = [one.file, one.label, one.decision, one.ahead, one.at_least, most]
+    words = [one.file, *called, one.ahead, one.at_least, most]
     return [*map(str, words), ", ".join(kinds) or "–"]
 
 

@@ -11,6 +11,7 @@ from itertools import islice
 import numpy as np
 
 from spikeloom.compiler.passes.calibrate import evenly_spaced
+from spikeloom.compiler.targets.netlist_file import names_of
 from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.base import Machine
@@ -85,6 +86,7 @@ def certify(
         shift=shift,
         most=most,
         certificates=tuple(certificates),
+        class_names=names_of(netlist.provenance, netlist.classes),
     )
 
 

@@ -1,6 +1,6 @@
 """What ``stress`` returns: curves by perturbation; and ``certify``: a certificate of each recording."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -215,6 +215,7 @@ class Certificates(Shown):
     most: int
     certificates: tuple[Certificate, ...]
     provenance: Provenance | None = None
+    class_names: Sequence[str] | None = field(default=None, metadata=OPTIONAL)
     # (taxels, 2 or 3) millimetres, as far as they are known
     places: FloatArray | None = field(default=None, metadata=HIDDEN)
 

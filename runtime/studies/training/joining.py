@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from spikeloom.models.recordings.evtouch import WHOLE
 from spikeloom.runtime.inputs.checkpoint import load_checkpoint
 from spikeloom.runtime.inputs.files import require_place, shipped
 from spikeloom.runtime.report.checkpoints import LayerSize, tower_line
+from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.sections import Section, Text
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.requests.choices import CheckpointChoice
@@ -58,9 +60,11 @@ def join(request: JoinRequest) -> Joined:
     require_place(request.output, "-o", request, ["pt"])
     checkpoints = [_network(name, request.weights) for name in request.checkpoints]
     pairs = zip(request.checkpoints, checkpoints, strict=True)
-    towers = [record for name, checkpoint in pairs for record in _records(name, checkpoint)]
+    records = [_records(name, checkpoint) for name, checkpoint in pairs]
+    towers = list(chain.from_iterable(records))
     if len(towers) < 2:
         raise OptionError(f"join: {request.checkpoints[0]} is one network already; give two or more")
+    _warn_of_twice(records)
     joined = side_by_side(checkpoints, request.checkpoints)
     origin = _common_origin(towers)
     output = Path(request.output)
@@ -77,6 +81,13 @@ def join(request: JoinRequest) -> Joined:
         file=output.name,
         sha256=sha256_of(output),
     )
+
+
+def _warn_of_twice(records: Sequence[Sequence[Mapping[str, Any]]]) -> None:
+    """Say on stderr that two of what is joined hold one network, by the towers of each."""
+    held = [{(tower["sha256"], tower["weights"]) for tower in each} for each in records]
+    if len(set().union(*held)) < sum(map(len, held)):
+        tell("warning: join: one network stands there twice: its votes count twice; join other seeds")
 
 
 def _common_origin(towers: Sequence[Mapping[str, Any]]) -> JsonObject:

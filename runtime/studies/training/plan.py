@@ -21,8 +21,8 @@ from spikeloom.models.training.recipes import RELEASED, STEPS, Recipe, check_rec
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.checkpoint import given_places, load_graph, sensor_places
 from spikeloom.runtime.inputs.compilation import whole_numbers
-from spikeloom.runtime.inputs.recordings import recordings, require_splits, warn_of_shared
-from spikeloom.runtime.report.console import progress, tell
+from spikeloom.runtime.inputs.recordings import recordings, require_splits, warn_of_missing, warn_of_shared
+from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.requests.training import TrainRequest
 from spikeloom.runtime.studies.training.seeds import Job, output_of
 
@@ -57,10 +57,7 @@ def both_splits(
 def _require_classes(training: Recordings, test: Recordings) -> None:
     """Refuse test recordings of classes beyond those of training; warn of others that training has not seen."""
     highest = int(training.labels.max())
-    seen = set(training.labels.tolist())
-    if missing := sorted({label for label in test.labels.tolist() if label <= highest} - seen):
-        named = ", ".join(map(training.class_name, missing))
-        tell(f"warning: {training.source}: no recordings to train class {named} on")
+    warn_of_missing(training, (label for label in test.labels.tolist() if label <= highest))
     if test.labels.max() > highest:
         first = int((test.labels > highest).argmax())
         where = f"{test.source}: {test.split}/{test.files[first]}"

@@ -12,7 +12,7 @@ from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.checkpoint import given_places, sensor_places
 from spikeloom.runtime.inputs.compilation import whole_numbers
 from spikeloom.runtime.inputs.files import require_place, write_picture
-from spikeloom.runtime.inputs.recordings import require_bins
+from spikeloom.runtime.inputs.recordings import require_bins, warn_of_few
 from spikeloom.runtime.report.drawing import PICTURES
 from spikeloom.runtime.requests.training import TrainRequest
 from spikeloom.runtime.studies.counting import CountersReport, train_counters
@@ -53,6 +53,8 @@ def train_networks(request: TrainRequest) -> TrainingReport:
         first_part(each, percent)
         for each in both_splits(request.data, graph.n_taxels, request.bin, request.groups)
     )
+    if request.join > 1:
+        warn_of_few(training, request.join)
     folds = []
     if request.groups is not None:
         folds = condition_folds(training, request.groups)
@@ -89,6 +91,8 @@ def train_counting(request: TrainRequest) -> CountersReport:
     plan = _counting_plan(request.join, options)
     taxels = None if request.taxels is None else len(sensor_places(request.taxels))
     training, test = both_splits(request.data, taxels, request.bin, request.groups)
+    if request.join > 1:
+        warn_of_few(training, request.join)
     folds = []
     if request.groups is not None:
         folds = condition_folds(training, request.groups)

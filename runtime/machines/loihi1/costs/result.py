@@ -14,7 +14,7 @@ from spikeloom.runtime.machines.injection import Injection, injection
 from spikeloom.runtime.machines.loihi1.costs.cost import NOT_PRICED, Costs, by_part
 from spikeloom.runtime.machines.loihi1.costs.estimate import Estimate
 from spikeloom.runtime.machines.loihi1.costs.timing import DetailedTimes, StepTimes
-from spikeloom.runtime.report.encode import INLINE, OPTIONAL
+from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL
 
 INPUTS = (
     "times: SANA-FE's own runs send input events from a core; those of a TactileSGNet take up to 3 % (simple) or 25 % "
@@ -143,7 +143,7 @@ class CostReport:
     """Costs of a batch of recordings.
 
     The mean inference and, each amount for itself, the extremes; where energy and time go; and what is
-    missing from all this. `chip_steps` are those of the longest recording.
+    missing from all this. `chip_steps` are those of the longest recording; others may be shorter.
     """
 
     samples: int
@@ -165,6 +165,7 @@ class CostReport:
     measured: str
     not_modelled: tuple[str, ...]
     not_priced: tuple[str, ...]
+    unequal: bool = field(metadata=HIDDEN)
 
 
 def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: float) -> CostReport:
@@ -178,6 +179,7 @@ def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: flo
     return CostReport(
         samples=len(costs.zeros),
         chip_steps=costs.steps,
+        unequal=bool(np.ptp(found.steps)),
         detail="cycle" if found.detailed else "counts",
         prices={table.name: table.title for table in target.energy},
         per_inference=whole(np.mean),

@@ -12,7 +12,10 @@ DYNAMIC = "dynamic energy, "
 
 def sections(report: CostReport) -> list[Section]:
     """Amounts, layers, parts of the chip, cores, and what power and times come to."""
-    steps = f"per inference of {report.chip_steps} chip steps, over {number(report.samples, 'recording')}:"
+    most = "up to " if report.unequal else ""
+    steps = (
+        f"per inference of {most}{report.chip_steps} chip steps, over {number(report.samples, 'recording')}:"
+    )
     parts = report.energy_by_part_j
     rows = [[table, *(si(value, "J") for value in each.values())] for table, each in parts.items()]
     by_part = [Table(["dynamic energy by part", *next(iter(parts.values()))], rows)] if parts else []
