@@ -314,6 +314,8 @@ def test_live_it_runs_to_the_end_of_the_ramp(trained, tmp_path, capsys):
     assert not capsys.readouterr().err
     assert stream.step(events[0, ..., 0] | 1).index == 79
     assert "events after the network's 80 steps: not used" in capsys.readouterr().err
+    stream.step(events[0, ..., 0] | 1)
+    assert not capsys.readouterr().err
     lines = [
         f"{t * 0.02:.2f},{taxel},{polarity}\n"
         for t, taxel, polarity in np.argwhere(events[0].transpose(2, 0, 1))

@@ -394,7 +394,10 @@ def test_a_table_gives_labels(listed):
     recordings = load_data(folder)
     assert recordings.files == ("a.csv", "b_label_2.csv", "c.csv")
     assert recordings.labels.tolist() == [7, 2, UNLABELLED]
-    assert recordings.counts.notes == ("own: labels.csv: describes 2 of 3 recordings",)
+    assert recordings.counts.notes == (
+        "own: labels.csv: describes 2 of 3 recordings",
+        "own: 1 of 2 recordings have no weight: no condition",
+    )
 
 
 def test_a_table_names_classes_and_conditions(listed):

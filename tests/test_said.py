@@ -227,6 +227,18 @@ def test_counters_end_a_grasp_early_without_being_told_its_length(said, place):
     assert known == said(f"watch counters.loom --input {file} --until-sure --bins {length}")
 
 
+def test_no_polarities_are_refused(refused, said):
+    said("export free.loom --to nir -o flat.nir")
+    told = "--polarities 0: allowed are numbers from 1"
+    assert refused("compile flat.nir --polarities 0 -o out.loom") == told
+
+
+def test_a_file_of_integers_is_to_be_compiled_first(refused, place):
+    (place / "x.net").write_bytes(b"\x89HDF\r\n\x1a\n")
+    told = "x.net: is a trained network; compile it first: spikeloom compile x.net -o NET.loom"
+    assert refused("inspect x.net") == told
+
+
 def test_progress_is_of_a_form_that_is_known(refused, said, monkeypatch):
     monkeypatch.setenv("SPIKELOOM_PROGRESS", "xml")
     assert (
@@ -252,7 +264,9 @@ def test_certificates_call_classes_by_name(said, place):
     said("train --system counters --data named --bin 0.05 --taxels 6 -o named.pt")
     said("compile named.pt -o named.loom")
     out, _ = said("certify named.loom --data named --limit 2 --most 1 --shift 1")
-    assert "cork" in out.partition("label")[2]
+    rows = [line.split() for line in out.splitlines() if "_label_" in line]
+    assert [name.split("_label_")[1].partition("_")[0] for name, *_ in rows] == [row[1] for row in rows]
+    assert {row[2] for row in rows} <= {"cork", "foam", "steel", "wool"}
 
 
 def test_storage_that_nothing_tests_is_not_said_to_keep_decisions(said, place):

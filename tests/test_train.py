@@ -434,7 +434,7 @@ def test_a_class_without_training_recordings_is_said(tmp_path, capsys):
     for file in (folder / "train").glob("*_label_1.npy"):
         file.unlink()
     both_splits(str(folder), None, None)
-    assert capsys.readouterr().err.endswith("warning: gap: no recordings to train class 1 on\n")
+    assert capsys.readouterr().err.endswith("warning: gap: no training recordings of class 1\n")
 
 
 @pytest.mark.parametrize("command", ["train --system counters -o OUT.pt", "smallest -o OUT.loom"])

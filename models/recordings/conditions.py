@@ -62,12 +62,13 @@ def groups_of(
 
 
 def group_notes(source: str, rows: Sequence[dict[str, str]]) -> list[str]:
-    """Columns of a table that only some recordings have a value in."""
+    """Columns of a table in which only some of its rows have a value."""
     notes = []
-    for name in dict.fromkeys(name for row in rows for name in row):
-        without = sum(not row.get(name) for row in rows)
-        if 0 < without < len(rows):
-            notes.append(f"{source}: {without} of {len(rows)} recordings have no {name}: no condition")
+    listed = [row for row in rows if row]
+    for name in listed[0] if listed else ():
+        without = sum(not row.get(name) for row in listed)
+        if 0 < without < len(listed):
+            notes.append(f"{source}: {without} of {len(listed)} recordings have no {name}: no condition")
     return notes
 
 

@@ -10,6 +10,10 @@ GAP_S = 0.5
 """A silence longer than this, between two events, counts as a gap; seconds."""
 
 
+UNIT_SPAN_S = 60.0
+"""Up to this length of a recording no unit is doubted."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EventCounts:
     """What was counted while recordings were put into bins; the fields are keys in JSON."""
@@ -32,6 +36,23 @@ class EventCounts:
             f"{number(self.duplicates, 'duplicate')} in a bin, {number(self.gaps, 'gap')} over {self.gap_s:g} s, "
             f"{number(self.shorter, 'recording')} shorter than the longest"
         )
+
+
+def time_note(first: float, last: float, moments: int) -> str:
+    """Why the times of a recording look wrong: its first and last, of so many different ones; or nothing.
+
+    A sensor that is touched sends several events a second: fewer than one, for a minute, are in a smaller unit.
+
+    >>> time_note(0, 2000, 40), time_note(0, 2, 40)
+    ('times up to 2000 s with less than an event a second; write seconds', '')
+    >>> time_note(90, 95, 200)
+    'events begin at 90 s; count times from the start of the recording'
+    """
+    if last > UNIT_SPAN_S and moments < last - first:
+        return f"times up to {last:g} s with less than an event a second; write seconds"
+    if first > max(last - first, 10 * GAP_S):
+        return f"events begin at {first:g} s; count times from the start of the recording"
+    return ""
 
 
 @cache

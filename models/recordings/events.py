@@ -22,7 +22,7 @@ from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.arrays import Binned, bins_joined, one_width, read_binned
 from spikeloom.models.recordings.classes import numbered
 from spikeloom.models.recordings.conditions import group_notes, groups_of
-from spikeloom.models.recordings.counts import GAP_S, EventCounts
+from spikeloom.models.recordings.counts import GAP_S, EventCounts, time_note
 from spikeloom.models.recordings.csvtable import NOTHING, Row, is_table, rows_beside
 from spikeloom.models.recordings.eventfiles import EventStream, read_stream
 from spikeloom.models.recordings.evtouch import BIN_S
@@ -39,9 +39,6 @@ from spikeloom.models.recordings.single import (
 )
 
 MAX_STEPS = 1_000_000
-
-UNIT_SPAN_S = 60.0
-"""Up to this length of a recording no unit is doubted."""
 
 # Times typed in decimals fall on edges, and 0.58 / 0.02 is 28.999999999999996. Of a bin; three roundings of
 # a quotient below MAX_STEPS are off by a third of it at most.
@@ -259,8 +256,7 @@ def bin_events(
     latest = int(np.argmax(stream.time_s))
     last = float(stream.time_s[latest])
     first = float(stream.time_s.min())
-    moments = len(np.unique(stream.time_s)) if last > UNIT_SPAN_S else 0
-    note = time_note(first, last, moments)
+    note = time_note(first, last, len(np.unique(stream.time_s)))
     if last / bin_s >= MAX_STEPS:
         remedy = (
             "write seconds"
@@ -285,23 +281,6 @@ def bin_events(
         gaps=int(np.count_nonzero(np.diff(np.sort(stream.time_s)) > GAP_S)),
         notes=(note,) if note else (),
     )
-
-
-def time_note(first: float, last: float, moments: int) -> str:
-    """Why the times of a recording look wrong: its first and last, of so many different ones; or nothing.
-
-    A sensor that is touched sends several events a second: fewer than one, for a minute, are in a smaller unit.
-
-    >>> time_note(0, 2000, 40), time_note(0, 2, 40)
-    ('times up to 2000 s with less than an event a second; write seconds', '')
-    >>> time_note(90, 95, 200)
-    'events begin at 90 s; count times from the start of the recording'
-    """
-    if last > UNIT_SPAN_S and moments < last - first:
-        return f"times up to {last:g} s with less than an event a second; write seconds"
-    if first > max(last - first, 10 * GAP_S):
-        return f"events begin at {first:g} s; count times from the start of the recording"
-    return ""
 
 
 def joined_bins(recordings: evtouch.Recordings, bins: int) -> evtouch.Recordings:

@@ -19,9 +19,8 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 
 from spikeloom.compiler.types import EventArray, IntArray, JsonObject
-from spikeloom.models.recordings.counts import number
+from spikeloom.models.recordings.counts import number, time_note
 from spikeloom.models.recordings.eventlines import Event, EventLines, Mark
-from spikeloom.models.recordings.events import time_note
 from spikeloom.runtime.machines.base import Step, Stream
 from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.encode import OPTIONAL

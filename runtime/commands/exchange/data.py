@@ -75,7 +75,7 @@ def _convert(request: ConvertRequest) -> Outcome:
     ]
     for recordings in loaded:
         show_notes(recordings.counts)
-        warn_of_few(recordings, bins)
+    longest = max(loaded, key=lambda recordings: recordings.steps)
     loaded = [joined_bins(recordings, bins) for recordings in loaded]
     taxels = max(recordings.taxels for recordings in loaded)
     steps = max(recordings.steps for recordings in loaded)
@@ -85,6 +85,7 @@ def _convert(request: ConvertRequest) -> Outcome:
         grown = [padded(recordings, taxels) for recordings in loaded]
         known = loaded[0].bin_s is not None or bins > 1
         write_released(request.output, grown, round(bins * loaded[0].seconds, 12) if known else None)
+    warn_of_few(longest, bins)
     result = Converted(
         source=request.source,
         output=request.output,
