@@ -27,6 +27,7 @@ from spikeloom.compiler.targets.loihi1.passes import PASSES
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.progress import FORM
 from spikeloom.models.recordings.grasps import synthetic_split
+from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence import reference
 from spikeloom.runtime.inputs import network
@@ -78,6 +79,7 @@ def test_provenance_names_everything_that_decided(as_json, place):
     }
     options = {"spike_exact": False, "keep_all": False, "prune_unused": False, "calibrated": True}
     options |= {"data": "data", "digests": report["provenance"]["digests"]}
+    options |= {"calibrated_sha256": load_data(place / "data", "train").events_sha256}
     assert report["provenance"] == source | storage | options
 
 

@@ -88,6 +88,7 @@ def test_recordings_that_calibrate_are_not_reported_in_silence(said, refused, pl
     assert "calibrat" not in said("anytime net.loom --data data --calibrate data")[1]
     once = "warning: test: 9 of 9 test recordings are training recordings, too"
     assert once in said("anytime net.loom --data data/test --calibrate data/test")[1]
+    assert "warning: data: 9 of 9 test" in said("lean net.pt --data data --split train")[1]
     told = "--held-out: data trained the network; omit it, or give others"
     assert refused("anytime counters.loom --data data --calibrate data --held-out") == told
 

@@ -15,7 +15,7 @@ from spikeloom.runtime.inputs.checkpoint import load_graph
 from spikeloom.runtime.inputs.compilation import remembered
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
-from spikeloom.runtime.inputs.recordings import recordings, require_splits
+from spikeloom.runtime.inputs.recordings import recordings, require_splits, warn_of_shared
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Outcome
@@ -62,6 +62,7 @@ def run(request: LeanRequest) -> Outcome:
     splits = (("train", None), (request.split, request.limit))
     each = (recordings(request.data, split, limit=limit, **shared) for split, limit in splits)
     training, test = (of_length(data, taken.clocks.length) for data in each)
+    warn_of_shared(training, test)
     result, netlist, spared = study(loaded, training, test, request.differ, request.output)
     if request.output is not None:
         lean = {"differ": result.differ} | encode(result.rows[result.taken].removed)

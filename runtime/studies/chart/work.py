@@ -165,9 +165,8 @@ def _read(data: Data, network: NetworkFile, groups: Groups) -> dict[str, Recordi
 
 
 def _calibration(work: Measurement) -> Recordings:
-    """The part of the training recordings that ``compile`` calibrates on, in steps of the network."""
-    network = work.network
-    return _part(network, _read(work.data, network, work.groups)["train"], network.window)
+    """The part of the training recordings that ``compile`` calibrates on, in their own bins."""
+    return first_part(_read(work.data, work.network, work.groups)["train"], work.network.window)
 
 
 @lru_cache(maxsize=2)
@@ -260,7 +259,7 @@ def _rounded(work: Measurement, loaded: LoadedNetwork) -> Compilation:
     options = Options(
         storage=storage_of(request, work.network.forms),
         prune_unused=request.prune_unused,
-        training_events=_calibration(work).events,
+        training_events=_part(work.network, _calibration(work), WHOLE).events,
     )
     return to_integers(loaded.network, options, load_target(request.target))
 
