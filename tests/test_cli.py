@@ -26,8 +26,8 @@ from spikeloom.compiler.targets.loihi1.netlist import read_netlist
 from spikeloom.compiler.targets.loihi1.passes import PASSES
 from spikeloom.models.graphs import build_graph
 from spikeloom.models.progress import FORM
-from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.models.recordings.events import load_data
+from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.runtime import cli
 from spikeloom.runtime.equivalence import reference
 from spikeloom.runtime.inputs import network
