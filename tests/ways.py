@@ -453,7 +453,7 @@ WIDE = ("mlp", "gcn", "grid-cnn", "binned", "joined", "joined-timed", "joined-tu
 
 # -- what cannot be ----------------------------------------------------------------------------------------------------
 _ONE_CHIP = "is for IBM TrueNorth, which {} does not take; give one for another chip"
-_INTEGERS = "holds integers, no float network to compare with; compile, inspect and run it"
+_INTEGERS = "holds integers, no float network to compare with; compile it, then inspect and run the netlist"
 _NO_FILE = "the following arguments are required: --checkpoint"
 _WINDOWS = "is free-running, which this cannot take; compile it without --free-running"
 _CORES = "holds crossbar cores (--target truenorth), this is for cores of compartments (--target loihi1)"
