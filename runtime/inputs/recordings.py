@@ -172,11 +172,11 @@ def _warn_of_steps(data: Recordings, trained: Mapping[str, Any]) -> None:
 def _warn_of_training(data: Recordings, trained: Mapping[str, Any]) -> None:
     """Say on stderr that what stands for new recordings is what trained the network."""
     did = {"train_sha256": "trained the network", "calibrated_sha256": "chose the network's storage"}
-    for name in did.keys() & trained.keys() if data.split != "train" else ():
-        if data.events_sha256 == trained[name]:
+    for name, done in did.items() if data.split != "train" else ():
+        if name in trained and data.events_sha256 == trained[name]:
             tell(
-                f"warning: {data.source}: these are the {number(len(data), 'recording')} that {did[name]}; what is "
-                "reached on them says nothing of others"
+                f"warning: {data.source}: these are the {number(len(data), 'recording')} that {done}; what is reached "
+                "on them says nothing of others"
             )
 
 
