@@ -60,19 +60,19 @@ def at_pace(data: Recordings, pace: float) -> Recordings:
     events = np.zeros((*data.events.shape[:3], int(steps.max())), np.uint8)
     sample, taxel, polarity, step = np.nonzero(data.events)
     events[sample, taxel, polarity, np.minimum((step / pace).astype(np.int64), steps[sample] - 1)] = 1
-    return replace(data, events=events, lengths=steps)
+    return replace(data, held=events, lengths=steps)
 
 
 def with_events_kept(data: Recordings, share: float, draw: np.random.Generator) -> Recordings:
     """Each event stays with this probability."""
-    return replace(data, events=data.events * (draw.random(data.events.shape) < share))
+    return replace(data, held=data.events * (draw.random(data.events.shape) < share))
 
 
 def without_taxels(data: Recordings, count: int, draw: np.random.Generator) -> Recordings:
     """Recordings in which some taxels, the same in all, send nothing."""
     events = data.events.copy()
     events[:, draw.permutation(data.taxels)[:count]] = 0
-    return replace(data, events=events)
+    return replace(data, held=events)
 
 
 def accuracies(decide: Decide, test: Recordings) -> dict[str, list[float]]:

@@ -10,7 +10,7 @@ import json
 import math
 import os
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -41,6 +41,9 @@ AGAIN = "copy or train it again"
 SIZE_LIMIT = 2**32
 """Bytes that a netlist file may have, 4 GiB: some hundred times the synapses of a whole chip."""
 
+HASHED = 1 << 24
+"""Bytes of an array that are hashed together."""
+
 ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 """Date of every member of a zip, fixed so that equal content gives equal bytes."""
 
@@ -62,12 +65,19 @@ def narrow(array: Array) -> Array:
     return array.astype("<i8")
 
 
+def _blocks(array: Array) -> Iterator[Array]:
+    """An array, some rows at a time."""
+    rows = max(1, HASHED // max(1, math.prod(array.shape[1:]) * array.dtype.itemsize))
+    return (array[first : first + rows] for first in range(0, array.shape[0], rows))
+
+
 def digest(members: Mapping[str, Array]) -> str:
     """Hex sha256 over name, dtype, shape and bytes of each member, in their order."""
     running = hashlib.sha256()
     for name, array in members.items():
         running.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        running.update(np.ascontiguousarray(array).tobytes())
+        for block in _blocks(array) if array.shape else [array]:
+            running.update(np.ascontiguousarray(block).tobytes())
     return running.hexdigest()
 
 

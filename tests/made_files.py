@@ -159,7 +159,7 @@ def recorded(events: np.ndarray, labels: np.ndarray | None = None, split: str = 
     """The same in memory."""
     labels = np.arange(len(events)) % CLASSES if labels is None else labels
     files = tuple(f"{i}.npy" for i in range(len(events)))
-    return Recordings(events=events, labels=labels, files=files, split=split, source="made")
+    return Recordings(held=events, labels=labels, files=files, split=split, source="made")
 
 
 def csv_folder(folder: Path, *, taxels: int = TAXELS, samples: int = 8, classes: int = CLASSES) -> Path:

@@ -34,7 +34,7 @@ from spikeloom.runtime.inputs import network
 from spikeloom.runtime.inputs import recordings as recordings_input
 from spikeloom.runtime.machines import base
 from spikeloom.runtime.machines.loihi1 import engine
-from spikeloom.runtime.machines.loihi1.costs import estimate
+from spikeloom.runtime.machines.loihi1.costs import pricing
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
 
@@ -379,7 +379,7 @@ def test_it_does_not_matter_how_many_recordings_are_held_at_a_time(as_json, monk
 
     report, spikes = found()
     monkeypatch.setattr(base, "HELD", 1)
-    monkeypatch.setattr(estimate, "HELD", 1)
+    monkeypatch.setattr(pricing, "HELD", 1)
     monkeypatch.setattr("spikeloom.models.networks.reference.STEPS", 7)
     again, parts = found()
     assert again == report

@@ -78,7 +78,7 @@ def test_a_counter_is_blocked_for_a_while_and_not_for_ever():
     events = np.zeros((3, TAXELS, 2, 400), np.uint8)
     for sample, ones in enumerate((2 * 3 + BLOCK - 1, 2 * 3 + BLOCK, 400)):
         events[sample, 0, 0, :ones] = 1
-    spikes = run_counters(replace(data, events=events), Plan(thresholds=(3,))).spikes
+    spikes = run_counters(replace(data, held=events), Plan(thresholds=(3,))).spikes
     assert spikes[:, 0].tolist() == [1, 2, 4]
 
 
@@ -125,7 +125,7 @@ def test_stress_runs_them_to_the_end_of_their_ramp(plan):
     late = SAMPLED["start_late"](other.events, 5)
     for found, recordings in (
         (clean(bench)[0], other),
-        (evaluate(pair, whole(late, pair.netlist, lengths)), replace(other, events=late)),
+        (evaluate(pair, whole(late, pair.netlist, lengths)), replace(other, held=late)),
     ):
         for side in ("float", "chip"):
             assert_array_equal(found.decisions(side), decisions_of(counters, recordings))
@@ -187,7 +187,7 @@ def test_impossible_plans_are_refused(plan, said):
 
 
 def test_recordings_without_events_are_refused():
-    silent = replace(made(), events=np.zeros((30, TAXELS, 2, STEPS), np.uint8))
+    silent = replace(made(), held=np.zeros((30, TAXELS, 2, STEPS), np.uint8))
     refused(DataError, "none of them spikes", fit, run_counters(silent, PLANS[0]), CLASSES)
 
 
@@ -214,7 +214,7 @@ def test_levels_are_told_apart_by_their_boundaries():
     plan = Plan(thresholds=(1,), strengths=(0.3,))
     right = [
         np.mean(
-            cross_validate(run_counters(replace(data, events=events), each), CLASSES)[0.3].argmax(axis=1)
+            cross_validate(run_counters(replace(data, held=events), each), CLASSES)[0.3].argmax(axis=1)
             == data.labels
         )
         for each in (plan, replace(plan, levels=3))

@@ -1,3 +1,5 @@
+import dataclasses
+import pickle
 from functools import partial
 from pathlib import Path
 
@@ -5,14 +7,24 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
 from oracles import refused
 
 from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.models.recordings import evtouch, stored
 from spikeloom.models.recordings.conditions import conditions
 from spikeloom.models.recordings.counts import GAP_S
 from spikeloom.models.recordings.eventfiles import EventStream, read_stream
-from spikeloom.models.recordings.events import MAX_STEPS, bin_events, data_splits, load_data, need_labels
-from spikeloom.models.recordings.evtouch import BIN_S, UNLABELLED, Recordings
+from spikeloom.models.recordings.events import (
+    MAX_STEPS,
+    bin_events,
+    data_splits,
+    joined_bins,
+    load_data,
+    need_labels,
+    of_length,
+)
+from spikeloom.models.recordings.evtouch import BIN_S, UNLABELLED, Recordings, first_part
 from spikeloom.models.recordings.grasps import synthetic_grasps
 from spikeloom.models.recordings.release import write_event_lines, write_released
 from spikeloom.runtime.studies.datasets import describe
@@ -40,7 +52,7 @@ def made(events, **changes) -> Recordings:
         "files": tuple("abcdefghijklmnop"[: len(events)]),
         "split": "test",
     }
-    return Recordings(events=np.asarray(events, np.uint8), source="made", **known | changes)
+    return Recordings(held=np.asarray(events, np.uint8), source="made", **known | changes)
 
 
 def one(path, **options):
@@ -477,3 +489,39 @@ def test_any_number_of_polarities(tmp_path):
         [load_data(tmp_path, limit=1)],
         0.02,
     )
+
+
+@pytest.mark.parametrize("in_memory", [1, 1 << 20])
+def test_events_that_lie_in_a_file_are_those_of_an_array(tmp_path, monkeypatch, in_memory):
+    monkeypatch.setattr(stored, "IN_MEMORY", in_memory)
+    rng = np.random.default_rng(3)
+    grids = [rng.random((5, 2, steps)) < 0.3 for steps in (9, 4, 7, 9)]
+    for index, grid in enumerate(grids):
+        np.save(tmp_path / f"sample_{index}_label_{index % 2}.npy", grid)
+    data = load_data(tmp_path)
+    events = np.zeros((4, 5, 2, 9), np.uint8)
+    for target, grid in zip(events, grids, strict=True):
+        target[..., : grid.shape[2]] = grid
+    array = dataclasses.replace(data, held=events)
+    again = pickle.loads(pickle.dumps(data))
+    assert isinstance(data.held, stored.Stored)
+    changes = {
+        "none": lambda each: each,
+        "bins": lambda each: joined_bins(each, 2),
+        "part": lambda each: first_part(each, 50),
+        "length": lambda each: of_length(each, 12),
+        "all": lambda each: of_length(joined_bins(first_part(each, 70), 2), 3),
+    }
+    for change in changes.values():
+        wanted, found = change(array), change(data)
+        monkeypatch.setattr(evtouch, "PART_BYTES", wanted.held[:3].nbytes)
+        assert [len(part) for part in found.parts()] == [3, 1]
+        assert_array_equal(
+            np.concatenate([part.events for part in found.parts()]), wanted.events, strict=True
+        )
+        assert_array_equal(found.events, wanted.events, strict=True)
+        assert_array_equal(change(again).events, wanted.events, strict=True)
+        assert_array_equal(found[::-2].events, wanted.events[::-2], strict=True)
+        assert_array_equal(found[1][0], wanted[1][0], strict=True)
+        assert found.sha256 == wanted.sha256
+        assert_array_equal(found.step_counts, wanted.step_counts)

@@ -211,7 +211,7 @@ def test_a_bomb_is_read_no_further_than_it_announces(tmp_path, size):
 
 def made(lengths=None, *, samples=3, steps=10):
     return Recordings(
-        events=events(samples=samples, steps=steps),
+        held=events(samples=samples, steps=steps),
         labels=np.arange(samples),
         files=tuple("abcdefgh"[:samples]),
         split="test",

@@ -145,7 +145,7 @@ def test_packets_that_leave_are_counted_and_their_way_is_not(netlist, recordings
 
 def test_the_report_says_what_is_not_modelled(netlist, recordings):
     _, found = estimate(netlist, SMALL, recordings)
-    report = encode(cost_report(netlist, SMALL, found, bin_s=0.02))
+    report = encode(cost_report(netlist, SMALL, found.totals, bin_s=0.02))
     left = report["per_inference"]["packets_between_chips"]
     assert f"links between the 3 chips: {left:,.0f} of " in report["not_modelled"][0]
     assert report["time"] == []

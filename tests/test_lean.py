@@ -96,7 +96,7 @@ def test_silenced_is_as_if_it_were_gone(compiled):
     silent = trials.silenced(netlist, trials.channels_of(netlist, taxels))
     quiet = seen.events.copy()
     quiet[:, taxels] = 0
-    assert_array_equal(counts(silent, seen), counts(netlist, replace(seen, events=quiet)))
+    assert_array_equal(counts(silent, seen), counts(netlist, replace(seen, held=quiet)))
     deaf = trials.laid_out(trials.without_taxels(compilation, taxels))
     gone = np.flatnonzero((netlist.layer == 1) & (netlist.neuron % 3 == 0))
     for less, same in (

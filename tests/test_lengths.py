@@ -128,7 +128,7 @@ def test_a_training_does_not_depend_on_the_longest_recording(folder):
     fit = []
     for steps in (90, 40):
         part = chosen.part(short)
-        part = replace(part, events=part.events[..., :steps])
+        part = replace(part, held=part.events[..., :steps])
         architecture = Architecture(taxels=TAXELS, classes=CLASSES)
         fit.append(train(part, part, np.eye(TAXELS), architecture, **options).last)
     for name, array in fit[0].items():

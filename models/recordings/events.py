@@ -17,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.types import AnyArray, EventArray, IntArray
+from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, IntArray
 from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.arrays import Binned, bins_joined, one_width, read_binned
 from spikeloom.models.recordings.classes import numbered
@@ -37,6 +37,7 @@ from spikeloom.models.recordings.single import (
     unit_notes,
     width_notes,
 )
+from spikeloom.models.recordings.stored import EventFile, Stored
 
 MAX_STEPS = 1_000_000
 
@@ -100,31 +101,33 @@ def load_data(
         rows = [table.rows.get(member, NOTHING) for member in files]
         single = place.is_file() and files == [source]
         where = [source if single else f"{source}: {Path(folder, name).as_posix()}" for name, _ in chosen]
-        read = _read_all(
+        read, file = _read_all(
             [(member, members[member]) for member in files], where, rows, bins, taxels, released=released
         )
     labels, names = numbered([each.label for each in read], table.classes, names, source)
     for each, label in zip(read, labels.tolist(), strict=True):
         evtouch.require_class(each.where, label, classes)
     width = one_width([each.bin_s for each in read], source)
-    events, steps = _stack(read, source)
+    steps = _lengths(read, file, source)
+    events = Stored(file, int(steps.max()))
     notes = [*table.notes, *silent_notes(read, source), *unit_notes(read)]
     notes += width_notes(read, [name for name, _ in chosen], source)
-    notes += taxel_notes(source, events) if taxels is None else []
-    notes += [*length_notes(source, events, steps), *polarity_notes(read, source, events)]
-    notes += group_notes(source, [row.groups for row in rows]) if groups is None else []
-    return evtouch.Recordings(
-        events=events,
+    data = evtouch.Recordings(
+        held=events,
         labels=labels,
         names=names,
         files=tuple(name for name, _ in chosen),
         split=split,
         source=source,
         lengths=None if steps.min() == steps.max() else steps,
-        counts=None if released and not notes else _sum_counts(read, steps, notes),
         bin_s=width,
         groups=groups_of(source, [name for name, _ in chosen], [row.groups for row in rows], groups),
     )
+    heard, ends = _heard(data)
+    notes += taxel_notes(source, heard.any(axis=1)) if taxels is None else []
+    notes += [*length_notes(source, ends, steps), *polarity_notes(read, source, heard.any(axis=0))]
+    notes += group_notes(source, [row.groups for row in rows]) if groups is None else []
+    return data if released and not notes else replace(data, counts=_sum_counts(read, steps, notes))
 
 
 def _require_options(bin_s: float | None, limit: int | None) -> None:
@@ -149,19 +152,16 @@ def _place_of(path: str | os.PathLike[str]) -> Path:
     return find_data(str(path)) if str(path) in DATA_SETS else Path(path)
 
 
-def _stack(read: Sequence[Single], source: str) -> tuple[EventArray, IntArray]:
-    """Events of all recordings, filled up with silence, and the steps of each."""
+def _lengths(read: Sequence[Single], file: EventFile, source: str) -> IntArray:
+    """Steps of each recording; refused if all, filled up with silence, are too large."""
     steps = np.array([each.steps for each in read], np.int64)
     if not steps.any():
         raise DataError(f"{source}: no events in any recording; check how they were written")
     steps[steps == 0] = round(float(np.median(steps[steps > 0])))
-    shape = max(each.grid.shape[0] for each in read), read[0].grid.shape[1], int(steps.max())
-    evtouch.require_memory(source, len(read) * math.prod(shape))
-    evtouch.require_lively(source, len(read) * math.prod(shape), sum(each.counts.events for each in read))
-    events = np.zeros((len(read), *shape), dtype=np.uint8)
-    for index, each in enumerate(read):
-        events[index, : each.grid.shape[0], :, : each.grid.shape[2]] = each.grid
-    return events, steps
+    size = math.prod(file.shape[:3]) * int(steps.max())
+    evtouch.require_memory(source, size)
+    evtouch.require_lively(source, size, sum(each.counts.events for each in read))
+    return steps
 
 
 def _sum_counts(read: Sequence[Single], steps: IntArray, notes: Sequence[str]) -> EventCounts:
@@ -179,18 +179,21 @@ def _read_all(
     taxels: int | None,
     *,
     released: bool,
-) -> list[Single]:
-    """All recordings; refused as soon as they are too large together."""
+) -> tuple[list[Single], EventFile]:
+    """All recordings, and their events; refused as soon as they are too large together."""
     read: list[Single] = []
+    stored = EventFile()
     size = sent = 0
     for (name, opener), place, row in zip(files, where, rows, strict=True):
-        read.append(_read(name, opener, place, bins, taxels, row))
-        _require_alike(read[-1], read[0], released)
-        size += read[-1].grid.size
-        sent += read[-1].counts.events
+        single, grid = _read(name, opener, place, bins, taxels, row)
+        _require_alike(single, read[0] if read else single, released)
+        read.append(single)
+        size += grid.size
+        sent += single.counts.events
         evtouch.require_memory(bins.source, size)
         evtouch.require_lively(bins.source, size, sent)
-    return read
+        stored.append(grid)
+    return read, stored
 
 
 def _require_alike(read: Single, first: Single, released: bool) -> None:
@@ -201,9 +204,9 @@ def _require_alike(read: Single, first: Single, released: bool) -> None:
             "recordings.csv, or remove it"
         )
     same = slice(0 if released else 1, 2)
-    if read.grid.shape[same] != first.grid.shape[same]:
+    if read.shape[same] != first.shape[same]:
         raise DataError(
-            f"{read.where}: shape {read.grid.shape}, the recordings before it have {first.grid.shape}; "
+            f"{read.where}: shape {read.shape}, the recordings before it have {first.shape}; "
             "taxels and polarities of a split must agree"
         )
 
@@ -291,7 +294,9 @@ def joined_bins(recordings: evtouch.Recordings, bins: int) -> evtouch.Recordings
     if bins == 1:
         return recordings
     lengths = None if recordings.lengths is None else -(-recordings.lengths // bins)
-    return replace(recordings, events=join_bins(recordings.events, bins), lengths=lengths)
+    return recordings.changed(
+        -(-recordings.steps // bins), lambda events, _: join_bins(events, bins), lengths
+    )
 
 
 def join_bins(events: AnyArray, bins: int) -> AnyArray:
@@ -311,7 +316,7 @@ def of_length(recordings: evtouch.Recordings, steps: int | None) -> evtouch.Reco
     """Recordings of so many steps each: shorter ones end in silence that counts, longer ones are cut; None: as is."""
     if steps is None:
         return recordings
-    return replace(recordings, events=fitted(recordings.events, steps), lengths=None)
+    return recordings.changed(steps, lambda events, _: fitted(events, steps), None)
 
 
 def fitted(events: AnyArray, steps: int) -> AnyArray:
@@ -366,9 +371,20 @@ def _flat(members: evtouch.Members) -> dict[str, dict[str, str]]:
     return {"": flat} if flat else {}
 
 
+def _heard(recordings: evtouch.Recordings) -> tuple[BoolArray, IntArray]:
+    """Channels (taxels, polarities) with an event, and the step after the last event of each recording (samples,)."""
+    heard = np.zeros(recordings.held.shape[1:3], np.bool_)
+    ends = []
+    for part in recordings.parts():
+        heard |= part.events.any(axis=(0, 3))
+        busy = part.events.any(axis=(1, 2))
+        ends.append(np.where(busy, np.arange(1, busy.shape[1] + 1), 0).max(axis=1))
+    return heard, np.concatenate(ends)
+
+
 def other_sensor(recordings: evtouch.Recordings) -> str | None:
     """Note that events are of a smaller sensor: in many recordings the last quarter of the taxels has none."""
-    last = int(np.flatnonzero(recordings.events.any(axis=(0, 2, 3))).max(initial=-1))
+    last = int(np.flatnonzero(_heard(recordings)[0].any(axis=1)).max(initial=-1))
     if (
         recordings.bin_s is None
         or len(recordings) < SEVERAL
@@ -385,22 +401,24 @@ def _read(
     bins: _Bins,
     taxels: int | None,
     row: Row,
-) -> Single:
-    """One recording, and what a table says of it."""
+) -> tuple[Single, EventArray]:
+    """One recording, with what a table says of it, and its events."""
     binned = read_binned(name, opener, where, taxels)
     if binned is not None:
-        found = _rebinned(binned, where, bins, row.duration_s)
+        found, grid = _rebinned(binned, where, bins, row.duration_s)
     else:
         stream = read_stream(name, taxels=taxels, where=where, opener=opener)
-        found = _from_events(stream, where, bins.of_events, taxels, row.duration_s)
+        found, grid = _from_events(stream, where, bins.of_events, taxels, row.duration_s)
     if row.label is None or found.label == row.label:
-        return found
+        return found, grid
     if found.label is not None:
         raise DataError(f"{where}: label {found.label}, and {row.label} in its table; fix one of them")
-    return replace(found, label=row.label)
+    return replace(found, label=row.label), grid
 
 
-def _rebinned(binned: Binned, where: str, bins: _Bins, duration_s: float | None) -> Single:
+def _rebinned(
+    binned: Binned, where: str, bins: _Bins, duration_s: float | None
+) -> tuple[Single, EventArray]:
     """A recording from an array, in bins as wide as wanted; its table says how long it is where it has no steps."""
     own = binned.bin_s or bins.stated
     place = where if binned.bin_s else bins.source
@@ -414,12 +432,12 @@ def _rebinned(binned: Binned, where: str, bins: _Bins, duration_s: float | None)
         gaps=int(np.count_nonzero((np.diff(busy) - 1) * (width or BIN_S) > GAP_S)),
     )
     steps = grid.shape[2] or _steps(duration_s or 0.0, width or BIN_S, where)
-    return Single(where, grid, binned.label, counts, steps, width, assumed=own is None)
+    return Single(where, grid.shape, binned.label, counts, steps, width, assumed=own is None), grid
 
 
 def _from_events(
     stream: EventStream, where: str, bin_s: float, taxels: int | None, duration_s: float | None
-) -> Single:
+) -> tuple[Single, EventArray]:
     """A recording from events, as long as its table says."""
     if len(stream.time_s):
         grid, counts = bin_events(stream, bin_s, taxels=taxels)
@@ -434,7 +452,7 @@ def _from_events(
             raise DataError(
                 f"{where}: an event at {last:g} s, its table says {duration_s:g} s; fix one of them"
             )
-    return Single(where, grid, stream.label, counts, steps, bin_s, sent=True)
+    return Single(where, grid.shape, stream.label, counts, steps, bin_s, sent=True), grid
 
 
 def _steps(duration_s: float, bin_s: float, where: str) -> int:

@@ -22,6 +22,7 @@ from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import reading
 from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, IntArray
 from spikeloom.models.recordings.counts import EventCounts, number
+from spikeloom.models.recordings.stored import Change, Stored
 
 MAX_POLARITIES = 8
 """Most polarities of a taxel; an array with more has its axes in another order."""
@@ -33,6 +34,9 @@ MAX_SILENT_BYTES = 256 << 20
 """Most bytes of bins that hold no event, beside `EVENT_BYTES` for each event: a small file may announce many."""
 
 EVENT_BYTES = 4096
+
+PART_BYTES = 16 << 20
+"""Bytes of bins that are looked at together."""
 
 BIN_S = 0.02
 """Width of a bin in seconds, as in the released recordings."""
@@ -55,8 +59,8 @@ class Recordings:
     """Event recordings of one split, in one array: shorter ones are filled up with silence that does not count."""
 
     # (samples, taxels, polarities, steps) uint8; 1 where a taxel sent an event of that polarity in that
-    # step; C-contiguous, read-only
-    events: EventArray
+    # step; an array is C-contiguous and read-only
+    held: EventArray | Stored
     labels: IntArray  # (samples,) int64; class of each recording, or `UNLABELLED`; read-only
     files: tuple[str, ...]  # File name of each recording
     split: str  # For example ``test``
@@ -71,9 +75,9 @@ class Recordings:
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("events", "labels", "lengths"):
+        for name in ("held", "labels", "lengths"):
             array = getattr(self, name)
-            if array is not None:
+            if isinstance(array, np.ndarray):
                 object.__setattr__(self, name, frozen(np.ascontiguousarray(array).view()))
 
     def __repr__(self) -> str:
@@ -96,11 +100,16 @@ class Recordings:
         if isinstance(index, slice):
             return self.part(index)
         place = range(len(self))[index]
-        return self.events[place, ..., : self.steps_of(place)], int(self.labels[place])
+        return self.held[place : place + 1][0, ..., : self.steps_of(place)], int(self.labels[place])
 
     def __iter__(self) -> Iterator[tuple[EventArray, int]]:
         """Events and label of each recording."""
         return map(self.__getitem__, range(len(self)))
+
+    @property
+    def events(self) -> EventArray:
+        """All of them in memory."""
+        return self.held.whole if isinstance(self.held, Stored) else self.held
 
     @property
     def seconds(self) -> float:
@@ -110,12 +119,12 @@ class Recordings:
     @property
     def taxels(self) -> int:
         """Taxels of each recording."""
-        return int(self.events.shape[1])
+        return int(self.held.shape[1])
 
     @property
     def steps(self) -> int:
         """Time steps of the longest recording."""
-        return int(self.events.shape[3])
+        return int(self.held.shape[3])
 
     @property
     def step_counts(self) -> IntArray:
@@ -135,7 +144,7 @@ class Recordings:
         indices = np.arange(len(self))[chosen]
         return replace(
             self,
-            events=self.events[chosen],
+            held=self.held[chosen] if isinstance(chosen, slice) else self.events[chosen],
             labels=self.labels[chosen],
             files=tuple(self.files[index] for index in indices),
             split=split or self.split,
@@ -143,9 +152,21 @@ class Recordings:
             groups={name: tuple(values[index] for index in indices) for name, values in self.groups.items()},
         )
 
-    def identity(self) -> dict[str, AnyArray]:
+    def parts(self) -> Iterator[Self]:
+        """All recordings, as many at a time as `PART_BYTES` hold."""
+        size = max(1, PART_BYTES // max(1, math.prod(self.held.shape[1:])))
+        return (self.part(slice(first, first + size)) for first in range(0, len(self), size))
+
+    def changed(self, steps: int, change: Change, lengths: IntArray | None) -> Self:
+        """The same recordings with other events, of so many steps, and lengths."""
+        held = self.held
+        if isinstance(held, Stored):
+            return replace(self, held=held.changed(steps, change), lengths=lengths)
+        return replace(self, held=change(held, range(len(self))), lengths=lengths)
+
+    def identity(self) -> dict[str, Any]:
         """Arrays that tell these recordings from others, whatever their names."""
-        arrays: dict[str, AnyArray] = {"events": self.events, "labels": self.labels}
+        arrays: dict[str, Any] = {"events": self.held, "labels": self.labels}
         return arrays if self.lengths is None else arrays | {"lengths": self.lengths}
 
     @property
@@ -298,8 +319,8 @@ def require_class(where: str, label: int, classes: int | None) -> None:
 
 def require_polarities(recordings: Recordings) -> None:
     """Refuse events that are neither falling nor rising: of another number of polarities than two; a DataError."""
-    if recordings.events.shape[2] != 2:
-        polarities = recordings.events.shape[2]
+    if recordings.held.shape[2] != 2:
+        polarities = recordings.held.shape[2]
         raise DataError(
             f"{recordings.source}: has {polarities} polarities, allowed are falling and rising; choose another"
         )
@@ -356,9 +377,12 @@ def first_part(recordings: Recordings, percent: int) -> Recordings:
     lengths = recordings.step_counts
     kept = steps_of(lengths, percent)
     longest = int(kept.max(initial=0))
-    events = recordings.events[..., :longest]
     if recordings.lengths is None:
-        return replace(recordings, events=events)
-    # what is joined to a later step, or run on, must not bring back what was cut off
-    inside = np.arange(longest) < kept[:, None, None, None]
-    return replace(recordings, events=events * inside, lengths=kept)
+        return recordings.changed(longest, lambda events, _: events[..., :longest], None)
+
+    def cut(events: EventArray, rows: range) -> EventArray:
+        # what is joined to a later step, or run on, must not bring back what was cut off
+        inside = np.arange(longest) < kept[np.array(rows), None, None, None]
+        return events[..., :longest] * inside
+
+    return recordings.changed(longest, cut, kept)

@@ -105,7 +105,7 @@ def synthetic_grasps(
         )
         events[index] = _grasp(np.random.Generator(np.random.PCG64(stream)), classes[label], place, steps)
     return Recordings(
-        events=events,
+        held=events,
         labels=labels,
         files=tuple(f"sample_{index}_label_{label}.npy" for index, label in enumerate(labels.tolist())),
         split="synthetic",

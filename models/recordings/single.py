@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.types import EventArray, IntArray
+from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.models.recordings.counts import EventCounts, number
 from spikeloom.models.recordings.evtouch import BIN_S, WIDTH
 
@@ -21,10 +21,10 @@ _RELEASED = re.compile(r"sample_[0-9]+_label_")
 
 @dataclass(frozen=True, slots=True)
 class Single:
-    """One recording in bins, (taxels, 2, steps), and what messages call it."""
+    """What is known of one recording in bins."""
 
-    where: str
-    grid: EventArray
+    where: str  # What messages call it
+    shape: tuple[int, ...]  # (taxels, polarities, steps with events)
     label: str | None
     counts: EventCounts
     steps: int  # Its length; 0 where it has no events, and nothing says how long it is
@@ -42,7 +42,7 @@ def unit_notes(read: Sequence[Single]) -> list[str]:
 
 def silent_notes(read: Sequence[Single], source: str) -> list[str]:
     """One line for all recordings without events."""
-    silent = [each for each in read if not each.grid.any()]
+    silent = [each for each in read if not each.counts.events]
     unknown = sum(each.steps == 0 for each in silent)
     line = f"{source}: {number(len(silent), 'recording')} without events"
     taken = "taken" if unknown == len(silent) else f"{unknown} of them taken"
@@ -58,26 +58,23 @@ def width_notes(read: Sequence[Single], names: Sequence[str], source: str) -> li
     return [f"{line}; write the seconds to {WIDTH} beside them"] if guessed else []
 
 
-def length_notes(source: str, events: EventArray, steps: IntArray) -> list[str]:
-    """Lengths (samples,) in a smaller unit leave nearly all of every recording silent."""
-    busy = events.any(axis=(1, 2))
-    ends = np.where(busy, np.arange(1, busy.shape[1] + 1), 0).max(axis=1)
+def length_notes(source: str, ends: IntArray, steps: IntArray) -> list[str]:
+    """Lengths (samples,) in a smaller unit leave nearly all of every recording silent, whose events end there."""
     if (SILENT * ends >= steps).any():
         return []
     return [f"{source}: no event after a tenth of each recording: are the lengths right, in seconds?"]
 
 
-def polarity_notes(read: Sequence[Single], source: str, events: EventArray) -> list[str]:
-    """A polarity that nothing has among several recordings that came as events."""
-    none = np.flatnonzero(~events.any(axis=(0, 1, 3)))
+def polarity_notes(read: Sequence[Single], source: str, heard: BoolArray) -> list[str]:
+    """A polarity that nothing has, of those (polarities,) `heard`, among several recordings that came as events."""
+    none = np.flatnonzero(~heard)
     if len(read) < SEVERAL or not all(each.sent for each in read) or not len(none):
         return []
     return [f"{source}: no event of polarity {none[0]} in {number(len(read), 'recording')}"]
 
 
-def taxel_notes(source: str, events: EventArray) -> list[str]:
-    """Taxels that count from 1 leave the first silent, and no other."""
-    alive = np.asarray(events.any(axis=(0, 2, 3)), np.bool_)
+def taxel_notes(source: str, alive: BoolArray) -> list[str]:
+    """Taxels that count from 1 leave the first silent, and no other; those (taxels,) that are `alive` have events."""
     if len(alive) < 4 or alive[0] or not alive[1:].all():
         return []
     return [

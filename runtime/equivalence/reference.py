@@ -78,7 +78,7 @@ def votes_so_far(network: Network, data: Recordings) -> IntArray:
     neurons = sum(population.size for population in network.populations)
     for part in parts_of(len(data), data.steps * neurons):
         progress(part.start, "float model")
-        spikes = reference(data.events[part])[readout.population]
+        spikes = reference(data.part(part).events)[readout.population]
         votes.append(votes_by_step(readout, network.classes, cut(spikes, lengths[part])))
     return np.concatenate(votes)
 

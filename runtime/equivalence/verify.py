@@ -116,11 +116,14 @@ def _compare_engines(
     """Fields of E0: the specification on the first recordings, a further engine on all."""
     beside = machine.beside(name)
     begin("specification", 0)
+    first = data.part(slice(samples))
     return {
         "spec_samples": samples,
-        "spec_different": machine.check(data.events[:samples], lengths=data.lengths),
+        "spec_different": machine.check(first.events, lengths=first.lengths),
         "engine": name,
-        "engine_different": None if beside is None else beside(data.events, data.lengths),
+        "engine_different": None
+        if beside is None
+        else sum(beside(part.events, part.lengths) for part in data.parts()),
     }
 
 
@@ -144,7 +147,7 @@ def _run(
 
 def _different_in_a_row(machine: Machine, data: Recordings, votes: Any) -> int | None:
     """Decisions that differ where recordings follow each other; None unless the chip runs freely."""
-    in_a_row = machine.in_a_row(data.events, data.lengths)
+    in_a_row = machine.in_a_row(data.held, data.lengths)
     return None if in_a_row is None else int(np.sum(vote(in_a_row) != vote(votes)))
 
 

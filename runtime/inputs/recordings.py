@@ -110,7 +110,7 @@ def _first(data: Recordings, limit: int | None) -> Recordings:
     """So many recordings; OptionError if that is none."""
     if limit is not None and limit < 1:
         raise OptionError(f"--limit {limit}: at least 1 recording is needed; give a positive number")
-    return data.part(slice(limit))
+    return data if limit is None else data.part(slice(limit))
 
 
 def _require_asked(bin_s: float | None, own: float | None) -> None:
@@ -193,8 +193,7 @@ def warn_of_shared(training: Recordings, test: Recordings) -> None:
     """Say on stderr how many test recordings are training recordings, too: silent ones may well be alike."""
 
     def digests(data: Recordings) -> list[bytes]:
-        parts = (each[..., : data.steps_of(index)] for index, each in enumerate(data.events))
-        return [hashlib.sha256(part.tobytes()).digest() if part.any() else b"" for part in parts]
+        return [hashlib.sha256(events.tobytes()).digest() if events.any() else b"" for events, _ in data]
 
     seen = set(digests(training)) - {b""}
     if count := sum(each in seen for each in digests(test)):
@@ -281,7 +280,9 @@ def in_steps(data: Recordings, netlist: Netlist, window: int = WHOLE) -> Recordi
     data = events.joined_bins(first_part(data, window), netlist.bins)
     length = netlist.clocks.length
     steps = origin_of(netlist.provenance).get("steps", length)
-    if length is not None and (late := int(data.events[..., steps:].sum(dtype=np.int64))):
+    if length is not None and (
+        late := sum(int(part.events[..., steps:].sum(dtype=np.int64)) for part in data.parts())
+    ):
         used = (
             "not used"
             if steps == length

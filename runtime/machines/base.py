@@ -2,20 +2,21 @@
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.dynamics import with_clocks
+from spikeloom.compiler.dynamics import Clocks, with_clocks
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.interpret import cut, vote
 from spikeloom.compiler.targets.base import Target, load_target, with_tables
 from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import BoolArray, EventArray, FloatArray, IntArray
+from spikeloom.models.recordings.stored import Stored
 from spikeloom.runtime.machines.changes import Changes, Effects, Groups, by_running
 from spikeloom.runtime.machines.core_map import CoreMap
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
@@ -148,10 +149,26 @@ def parts_of(recordings: int, entries: int) -> Iterator[slice]:
     return (slice(first, min(first + size, recordings)) for first in range(0, recordings, size))
 
 
-def one_by_one(channels: EventArray, lengths: IntArray | None) -> Iterator[EventArray]:
-    """Recordings (samples, channels, steps) in turn, each as long as it is."""
-    for index, each in enumerate(channels):
+def one_by_one(
+    events: EventArray | Stored, clocks: Clocks, lengths: IntArray | None
+) -> Iterator[EventArray]:
+    """Recordings in turn, (channels, steps), each as long as it is."""
+    for index in range(len(events)):
+        each = with_clocks(events[index : index + 1], clocks)[0]
         yield each if lengths is None else each[:, : lengths[index]]
+
+
+def joined(parts: Sequence[Any]) -> Any:
+    """One dataclass or mapping of arrays, (samples, …), from those of some recordings each."""
+    first = parts[0]
+    if first is None:
+        return None
+    if isinstance(first, Mapping):
+        return {name: joined([part[name] for part in parts]) for name in first}
+    if is_dataclass(first):
+        names = (each.name for each in fields(first))
+        return type(first)(**{name: joined([getattr(part, name) for part in parts]) for name in names})  # type: ignore[misc]
+    return np.concatenate(parts)
 
 
 def differences(slow: Any, fast: Any) -> int:
@@ -195,6 +212,19 @@ class Stream(Protocol):
 
     def reset(self) -> None:
         """Begin the next grasp, from rest."""
+
+
+class Pricing(Protocol):
+    """A netlist and the tables of its chip, ready to price recordings, as many at a time as memory holds."""
+
+    def batch(self, steps: int) -> int:
+        """How many those are, of so many data steps."""
+
+    def run(self, channels: EventArray, lengths: IntArray | None) -> tuple[Any, Any]:
+        """Trace of some, (samples, channels, steps), and what is to be kept of them, which :func:`joined` joins."""
+
+    def price(self, totals: Any, bin_s: float) -> Price:
+        """The price of all, from what was kept; `bin_s` are seconds of a step at the pace of the sensor."""
 
 
 @dataclass(frozen=True)
@@ -248,7 +278,7 @@ class Machine(ABC):
                 "netlist: is free-running, which this cannot take; compile it without --free-running"
             )
 
-    def in_a_row(self, events: EventArray, lengths: IntArray | None) -> IntArray | None:  # noqa: ARG002
+    def in_a_row(self, events: EventArray | Stored, lengths: IntArray | None) -> IntArray | None:  # noqa: ARG002
         """Votes (samples, classes) of recordings that follow each other on a free-running chip; None on another."""
         return None
 
@@ -287,16 +317,8 @@ class Machine(ABC):
         """All that the specification keeps of one recording (channels, steps), and a batch of it by the simulator."""
 
     @abstractmethod
-    def priced(
-        self,
-        channels: EventArray,
-        lengths: IntArray | None,
-        chip: Target,
-        bin_s: float,
-        detail: str,
-        progress: Done,
-    ) -> tuple[Trace, Price]:
-        """Trace and price of recordings (samples, channels, steps), by the tables of a chip; see :meth:`price`."""
+    def pricing(self, chip: Target, detail: str) -> "Pricing":
+        """What prices recordings by the tables of a chip; see :meth:`price`."""
 
     def _run(self, trace: Trace) -> Run:
         """What a trace comes to."""
@@ -341,19 +363,21 @@ class Machine(ABC):
 
     def price(
         self,
-        events: EventArray,
+        events: EventArray | Stored,
         *,
         bin_s: float,
         lengths: IntArray | None = None,
         detail: str = "counts",
         table: str | None = None,
         progress: Done = None,
+        counts: bool = False,
     ) -> tuple[Run, Price]:
-        """Run recordings as :meth:`run` does, keep no spikes, and price them.
+        """Run recordings as :meth:`run` does, some at a time, and price them; no spikes are kept.
 
         `bin_s` are the seconds of a bin at the pace of the sensor, `detail` is one of `details`, `table` the
         name of a table of prices or a TOML file with some; `progress` is called with the number of
-        recordings done. Raises OptionError if there is no such table or detail.
+        recordings done. The counts of the :class:`Run` are empty unless wanted. Raises OptionError if there
+        is no such table or detail.
         """
         if detail not in self.details:
             allowed = ", ".join(self.details)
@@ -361,14 +385,24 @@ class Machine(ABC):
                 f"--detail {detail}: {self.netlist.target} has no such price model; allowed: {allowed}"
             )
         chip = self.target if table is None else with_tables(self.target, table)
-        channels = with_clocks(events, self.netlist.clocks)
-        trace, price = self.priced(channels, lengths, chip, bin_s, detail, progress)
-        return self._run(trace), price
+        pricing = self.pricing(chip, detail)
+        size = pricing.batch(events.shape[-1])
+        runs, totals = [], []
+        for first in range(0, max(1, len(events)), size):
+            rows = slice(first, min(first + size, len(events)))
+            channels = with_clocks(events[rows], self.netlist.clocks)
+            trace, total = pricing.run(channels, None if lengths is None else lengths[rows])
+            ran = self._run(trace)
+            runs.append(ran if counts else replace(ran, counts=ran.counts[:0]))
+            totals.append(total)
+            if progress is not None:
+                progress(rows.stop)
+        return joined(runs), pricing.price(joined(totals), bin_s * self.netlist.bins)
 
     def check(self, events: EventArray, *, lengths: IntArray | None = None) -> int:
         """Spikes, membranes and counts in which simulator and specification differ; events and lengths as for `run`."""
-        channels = with_clocks(events, self.netlist.clocks)
-        return sum(differences(*self.spec_and_engine(sample)) for sample in one_by_one(channels, lengths))
+        each = one_by_one(events, self.netlist.clocks, lengths)
+        return sum(differences(*self.spec_and_engine(channels)) for channels in each)
 
     def beside(self, engine: str) -> Callable[[EventArray, IntArray | None], int] | None:
         """Make one of ``ENGINES`` ready to run recordings of some lengths; None for our own.
@@ -403,10 +437,6 @@ class Machine(ABC):
         Events may change in the first `steps`; `apart` (spacings,) rise from 1. See :class:`Groups`.
         """
         return None
-
-    def batch(self, steps: int) -> int:  # noqa: ARG002
-        """Recordings of so many data steps whose price is worked out at a time where memory is short."""
-        return PART
 
     def stream(self) -> Stream:
         """State of one grasp that runs bin after bin; OptionError if the simulator runs whole recordings only."""

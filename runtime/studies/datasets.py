@@ -166,4 +166,4 @@ def converted_sections(result: Converted) -> Iterator[Section]:
 def padded(recordings: Recordings, taxels: int) -> Recordings:
     """Silence for the taxels that only another split has."""
     missing = taxels - recordings.taxels
-    return replace(recordings, events=np.pad(recordings.events, [(0, 0), (0, missing), (0, 0), (0, 0)]))
+    return replace(recordings, held=np.pad(recordings.events, [(0, 0), (0, missing), (0, 0), (0, 0)]))

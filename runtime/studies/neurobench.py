@@ -83,10 +83,11 @@ def _spike_counts(machine: Comparable, data: Recordings) -> dict[int, IntArray]:
     """Spikes of each source, (recordings, sources), by population, and of the input channels."""
     counts: dict[int, list[IntArray]] = {}
     for part in machine.parts(len(data), data.steps):
-        lengths = data.step_counts[part]
-        ran = machine.run(data.events[part], lengths=lengths, spikes=True)
+        some = data.part(part)
+        lengths = some.step_counts
+        ran = machine.run(some.events, lengths=lengths, spikes=True)
         trains: list[BoolArray] = [
-            channels_last(data.events[part], machine.netlist.clocks),
+            channels_last(some.events, machine.netlist.clocks),
             *ran.spikes.values(),
         ]
         for population, spikes in enumerate(trains, INPUT):

@@ -52,7 +52,7 @@ def price(request: EstimateRequest) -> tuple[Machine, Run, Price]:
     machine = machine_for(request.netlist)
     data = load_recordings(request.data, request, machine.netlist)
     ran, priced = machine.price(
-        data.events,
+        data.held,
         bin_s=data.seconds,
         lengths=data.lengths,
         detail=request.detail,

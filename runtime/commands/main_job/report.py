@@ -94,7 +94,7 @@ def _report(
         apart = np.flatnonzero(decided != verdict.chip_predictions)
         chosen = int(apart[0]) if len(apart) else 0 if first is None else data.files.index(first.file)
     progress("pricing")
-    ran, price = machine.price(data.events, lengths=data.lengths, bin_s=data.seconds)
+    ran, price = machine.price(data.held, lengths=data.lengths, bin_s=data.seconds, counts=True)
     origin = provenance(request, netlist, machine.target, loaded, recorded, data.files[chosen])
     described = describe(request.netlist)
     return Report(

@@ -24,7 +24,8 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist, read_netlist
 from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
 from spikeloom.models.recordings.evtouch import WHOLE
-from spikeloom.runtime.machines.base import Done, Model, Price, Run, T, differences, one_by_one
+from spikeloom.models.recordings.stored import Stored
+from spikeloom.runtime.machines.base import Model, Price, Run, T, differences, one_by_one
 from spikeloom.runtime.machines.capabilities import Cumulative, Damageable, Explainable, Memory, Stoppable
 from spikeloom.runtime.machines.changes import Changes, Effects, Groups
 from spikeloom.runtime.machines.deviations import Deviations
@@ -34,16 +35,14 @@ from spikeloom.runtime.machines.loihi1.trace import Trace, aligned, unpack
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.votes import class_counts
 from spikeloom.runtime.report.console import tell
-from spikeloom.runtime.report.sections import Block, Outcome
+from spikeloom.runtime.report.sections import Block
 
 if TYPE_CHECKING:
     from spikeloom.runtime.machines.core_map import CoreMap
     from spikeloom.runtime.machines.loihi1.changes.chip import Chip
+    from spikeloom.runtime.machines.loihi1.costs.pricing import LoihiPricing
 
 # What only some commands need is imported where it is used: a tenth of a second that `run` need not wait.
-
-SUMS = 1 << 24
-"""Sums of the time model that are held at a time: 128 MiB."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,7 @@ class Loihi(Damageable, Explainable, Stoppable):
         different = super().check(events, lengths=lengths)
         if self.free_running:
             pause = np.zeros((self.netlist.n_inputs, self.netlist.blank), events.dtype)
-            each = one_by_one(with_clocks(events, self.netlist.clocks), lengths)
+            each = one_by_one(events, self.netlist.clocks, lengths)
             row = np.concatenate([part for channels in each for part in (channels, pause)], axis=1)
             different += differences(*self.spec_and_engine(row))
         return different
@@ -157,14 +156,14 @@ class Loihi(Damageable, Explainable, Stoppable):
         voting = np.unique(self.netlist.layer[self.netlist.voters])
         return max(int(self.netlist.layers[layer].depth) for layer in voting.tolist())
 
-    def in_a_row(self, events: EventArray, lengths: IntArray | None) -> IntArray | None:
+    def in_a_row(self, events: EventArray | Stored, lengths: IntArray | None) -> IntArray | None:
         """Registers are carried over from one to the next."""
         if not self.free_running:
             return None
         state = engine.start(self._stepwise)
         lag = self.netlist.max_depth
         counts = []
-        for channels in one_by_one(with_clocks(events, self.netlist.clocks), lengths):
+        for channels in one_by_one(events, self.netlist.clocks, lengths):
             before = state.spikes.copy()
             steps = channels.shape[1]
             engine.advance(self._stepwise, state, channels, length=steps, steps=steps + lag)
@@ -287,39 +286,12 @@ class Loihi(Damageable, Explainable, Stoppable):
 
         return page.figures(price.outcome.result)
 
-    def priced(
-        self,
-        channels: EventArray,
-        lengths: IntArray | None,
-        chip: Target,
-        bin_s: float,
-        detail: str,
-        progress: Done,
-    ) -> tuple[Trace, Price]:
+    def pricing(self, chip: Target, detail: str) -> LoihiPricing:
         """Costs, of the cores' tiles and times too."""
-        from spikeloom.runtime.machines.loihi1.costs.estimate import estimate
-        from spikeloom.runtime.machines.loihi1.costs.result import cost_report
-        from spikeloom.runtime.machines.loihi1.costs.sections import sections
+        from spikeloom.runtime.machines.loihi1.costs import estimate
+        from spikeloom.runtime.machines.loihi1.costs.pricing import LoihiPricing
 
-        trace, estimated = estimate(
-            self._engine, chip, channels, lengths=lengths, detail=detail, progress=progress
-        )
-        report = cost_report(self.netlist, chip, estimated, bin_s=bin_s * self.netlist.bins)
-        energy = {name: each.sum(axis=1) for name, each in estimated.costs.energy.items()}
-        return trace, Price(
-            synaptic_operations=estimated.costs.synaptic_operations.sum(axis=1),
-            energy_j=energy,
-            time_s={name: times.seconds for name, times in estimated.simple.items()},
-            step_s={name: float(times.duration_ns.max() * 1e-9) for name, times in estimated.simple.items()},
-            dynamic_j=energy,
-            static_w={each.source: each.chips * each.chip_w for each in report.static},
-            outcome=Outcome(report, sections),
-        )
-
-    def batch(self, steps: int) -> int:
-        """As many recordings as keep the sums of the time model small."""
-        sums = (steps + self.netlist.drain) * 2 * self.netlist.n_cores * max(1, len(self.target.time))
-        return max(1, SUMS // sums)
+        return LoihiPricing(estimator=estimate.prepare(self._engine, chip, detail))
 
     def stream(self) -> Stream:
         """One grasp, bin after bin."""

@@ -16,12 +16,13 @@ import numpy as np
 
 from spikeloom.compiler.targets.base import EnergyTable, Target
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import EventArray, FloatArray, IntArray
 from spikeloom.models.recordings.counts import number
 from spikeloom.runtime.machines import injection
-from spikeloom.runtime.machines.base import Price
-from spikeloom.runtime.machines.injection import Injection
-from spikeloom.runtime.machines.truenorth.spec import Counts
+from spikeloom.runtime.machines.base import PART, Price
+from spikeloom.runtime.machines.injection import Injection, input_events
+from spikeloom.runtime.machines.truenorth.engine import Engine, simulate
+from spikeloom.runtime.machines.truenorth.spec import Trace
 from spikeloom.runtime.report.numbers import dominant, si
 from spikeloom.runtime.report.sections import Outcome, Section, Table, Text
 
@@ -100,23 +101,66 @@ class Estimate:
     not_priced: tuple[str, ...] = NOT_PRICED
 
 
-def price(
-    netlist: CrossbarNetlist, chip: Target, counts: Counts, inputs: IntArray, steps: IntArray, bin_s: float
-) -> Price:
-    """Count and price recordings; `counts`, `inputs` that come and data `steps` have one leading axis."""
-    received, sent = _by_layer(netlist, counts)
-    packets = counts.spikes[:, netlist.wire_neuron]
-    counted = {
-        "synaptic_events": received.sum(axis=1),
-        "spikes": sent.sum(axis=1),
-        "packets": packets.sum(axis=1),
-        "hops": packets @ netlist.hops(),
-        "ticks": counts.ticks,
-        "merged_spikes": counts.merged,
-        "membranes_saturated": counts.overflows.sum(axis=1),
-    }
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Totals:
+    """What is kept of recordings: amounts, input events and data steps, (samples,), and events by layer."""
+
+    counted: Mapping[str, IntArray]
+    received: IntArray  # (samples, layers) int64; synaptic events by the layer that receives
+    sent: IntArray  # (samples, layers) int64; spikes by the layer that sends
+    inputs: IntArray
+    steps: IntArray
+
+
+class Pricing:
+    """As :class:`machines.base.Pricing`."""
+
+    def __init__(self, prepared: Engine, chip: Target) -> None:
+        self._engine = prepared
+        self._chip = chip
+        netlist = prepared.netlist
+        layers = len(netlist.layers)
+        self._points = np.zeros((netlist.n_axons, layers), np.int64)
+        np.add.at(self._points, (netlist.axon_of_synapse(), netlist.layer[netlist.neuron_of_synapse()]), 1)
+        self._senders = np.eye(layers, dtype=np.int64)[netlist.layer]
+        self._hops = netlist.hops()
+
+    def batch(self, steps: int) -> int:  # noqa: ARG002
+        """A few: their counts of axons are what fills memory."""
+        return PART
+
+    def run(self, channels: EventArray, lengths: IntArray | None) -> tuple[Trace, Totals]:
+        """Synaptic events, spikes and ticks."""
+        trace = simulate(self._engine, channels, lengths=lengths)
+        counts = trace.counts
+        steps = (
+            np.full(len(channels), channels.shape[-1]) if lengths is None else np.asarray(lengths, np.int64)
+        )
+        received = counts.axons @ self._points
+        sent = counts.spikes @ self._senders
+        packets = counts.spikes[:, self._engine.netlist.wire_neuron]
+        counted = {
+            "synaptic_events": received.sum(axis=1),
+            "spikes": sent.sum(axis=1),
+            "packets": packets.sum(axis=1),
+            "hops": packets @ self._hops,
+            "ticks": counts.ticks,
+            "merged_spikes": counts.merged,
+            "membranes_saturated": counts.overflows.sum(axis=1),
+        }
+        inputs = input_events(channels, steps)
+        return trace, Totals(counted=counted, received=received, sent=sent, inputs=inputs, steps=steps)
+
+    def price(self, totals: Totals, bin_s: float) -> Price:
+        """By both readings."""
+        return price(self._engine.netlist, self._chip, totals, bin_s)
+
+
+def price(netlist: CrossbarNetlist, chip: Target, totals: Totals, bin_s: float) -> Price:
+    """Price recordings by what was kept of them."""
+    counted = totals.counted
     tick_s = chip.limit("tick.length") * 1e-6
-    time_s: FloatArray = counts.ticks.astype(np.float64) * tick_s
+    time_s: FloatArray = counted["ticks"].astype(np.float64) * tick_s
     step_s = netlist.bin_ticks * tick_s
     parts = {table.name: joules(table, counted["synaptic_events"], time_s) for table in chip.energy}
     energy = {name: events if floor is None else events + floor for name, (events, floor) in parts.items()}
@@ -130,7 +174,8 @@ def price(
             energy_j={name: float(reduce(values)) for name, values in energy.items()},
         )
 
-    means = zip(netlist.layers, received.mean(axis=0).tolist(), sent.mean(axis=0).tolist(), strict=True)
+    by_layer = totals.received.mean(axis=0).tolist(), totals.sent.mean(axis=0).tolist()
+    means = zip(netlist.layers, *by_layer, strict=True)
     used = netlist.n_cores / chip.limit("chip.cores")
     result = Estimate(
         samples=len(time_s),
@@ -143,7 +188,7 @@ def price(
         energy=tuple(_reading(table, *parts[table.name], energy[table.name], used) for table in chip.energy),
         pace=Pace(bin_s=bin_s, step_s=step_s, real_time=step_s <= bin_s),
         static_w={name: power.value * 1e-3 for name, power in chip.static.items()},
-        injection=injection.injection(chip, 1, inputs, steps, bin_s),
+        injection=injection.injection(chip, 1, totals.inputs, totals.steps, bin_s),
     )
     return Price(
         synaptic_operations=counted["synaptic_events"],
@@ -154,14 +199,6 @@ def price(
         static_w=result.static_w,
         outcome=Outcome(result, sections),
     )
-
-
-def _by_layer(netlist: CrossbarNetlist, counts: Counts) -> tuple[IntArray, IntArray]:
-    """Synaptic events by the layer that receives, and spikes by the layer that sends; (samples, layers)."""
-    layers = len(netlist.layers)
-    points = np.zeros((netlist.n_axons, layers), np.int64)
-    np.add.at(points, (netlist.axon_of_synapse(), netlist.layer[netlist.neuron_of_synapse()]), 1)
-    return counts.axons @ points, counts.spikes @ np.eye(layers, dtype=np.int64)[netlist.layer]
 
 
 def _reading(

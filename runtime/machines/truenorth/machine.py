@@ -11,8 +11,7 @@ from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars, unlike
 from spikeloom.compiler.targets.truenorth.passes import Source, compile_crossbars
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
-from spikeloom.runtime.machines.base import Done, Machine, Model, Price, Run
-from spikeloom.runtime.machines.injection import input_events
+from spikeloom.runtime.machines.base import Machine, Model, Run
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.truenorth import cost, engine, spec
 from spikeloom.runtime.machines.truenorth.model import model_of
@@ -79,22 +78,9 @@ class TrueNorth(Machine):
         fast = engine.simulate(self._engine, channels[None], spikes=True, membranes=True)
         return spec.simulate(self.netlist, channels), fast
 
-    def priced(
-        self,
-        channels: EventArray,
-        lengths: IntArray | None,
-        chip: Target,
-        bin_s: float,
-        detail: str,
-        progress: Done,
-    ) -> tuple[Trace, Price]:
+    def pricing(self, chip: Target, detail: str) -> cost.Pricing:
         """By synaptic events and ticks."""
-        trace = self.simulate(channels, lengths, spikes=False)
-        steps = (
-            np.full(len(channels), channels.shape[-1]) if lengths is None else np.asarray(lengths, np.int64)
-        )
-        inputs = input_events(channels, steps)
-        return trace, cost.price(self.netlist, chip, trace.counts, inputs, steps, bin_s * self.netlist.bins)
+        return cost.Pricing(self._engine, chip)
 
 
 def load(path: str | os.PathLike[str]) -> TrueNorth:

@@ -1,15 +1,12 @@
 """The measurement of a candidate: its decisions on the chip, and what a mean inference costs."""
 
-from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
-
-from spikeloom.compiler.types import FloatArray, IntArray
+from spikeloom.compiler.types import IntArray
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.base import Machine, Price
+from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.studies.search.results import Costs, NetlistCosts
 
 
@@ -19,21 +16,9 @@ def decisions(netlist: Any, data: Recordings) -> IntArray:
 
 
 def measure(machine: Machine, data: Recordings, bin_s: float) -> tuple[IntArray, Costs]:
-    """Class of each recording, and the costs of a mean inference; as many recordings at a time as memory holds."""
-    size = machine.batch(data.steps)
-    parts = [slice(first, first + size) for first in range(0, len(data), size)]
-    lengths = data.step_counts
-    runs = [machine.price(data.events[part], bin_s=bin_s, lengths=lengths[part]) for part in parts]
-    prices = [price for _, price in runs]
-
-    def by_table(of: Callable[[Price], Mapping[str, FloatArray]]) -> dict[str, FloatArray]:
-        return {table: np.concatenate([of(price)[table] for price in prices]) for table in of(prices[0])}
-
-    operations = np.concatenate([price.synaptic_operations for price in prices])
-    costs = Costs.mean(
-        operations, by_table(lambda price: price.energy_j), by_table(lambda price: price.time_s)
-    )
-    return np.concatenate([run.decisions for run, _ in runs]), costs
+    """Class of each recording, and the costs of a mean inference."""
+    run, price = machine.price(data.held, bin_s=bin_s, lengths=data.lengths)
+    return run.decisions, Costs.mean(price.synaptic_operations, price.energy_j, price.time_s)
 
 
 def measure_netlist(netlist: Any, data: Recordings) -> tuple[IntArray, NetlistCosts]:

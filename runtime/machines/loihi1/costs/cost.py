@@ -184,18 +184,20 @@ def by_part(target: Target, events: Mapping[str, FloatArray]) -> dict[str, dict[
 
 def price(meter: Meter, counts: Counts, chip_steps: int | IntArray) -> Costs:
     """Price a run with every table of its chip; `counts` and `chip_steps` as for :func:`count`."""
-    amounts = count(meter, counts, chip_steps)
+    return costs_of(meter.target, count(meter, counts, chip_steps), chip_steps)
+
+
+def costs_of(target: Target, amounts: Mapping[str, FloatArray], chip_steps: int | IntArray) -> Costs:
+    """Price what :func:`count` found."""
     events = {event: amounts[event] for event in EVENTS}
-    energy = by_table(meter.target, events)
+    energy = by_table(target, events)
     return Costs(
         events=events,
         zeros=amounts["zeros"],
         between_chips=amounts[BETWEEN_CHIPS],
         steps=int(np.max(chip_steps)),
         energy=energy,
-        unpriced={
-            table.name: lacking(table, events) for table in meter.target.energy if table.name not in energy
-        },
+        unpriced={table.name: lacking(table, events) for table in target.energy if table.name not in energy},
     )
 
 

@@ -12,8 +12,8 @@ from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.types import FloatArray
 from spikeloom.runtime.machines.injection import Injection, injection
 from spikeloom.runtime.machines.loihi1.costs.cost import NOT_PRICED, Costs, by_part
-from spikeloom.runtime.machines.loihi1.costs.estimate import Estimate
-from spikeloom.runtime.machines.loihi1.costs.timing import DetailedTimes, StepTimes
+from spikeloom.runtime.machines.loihi1.costs.estimate import Totals
+from spikeloom.runtime.machines.loihi1.costs.timing import DetailedSpent, Spent
 from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL
 
 INPUTS = (
@@ -168,9 +168,10 @@ class CostReport:
     unequal: bool = field(metadata=HIDDEN)
 
 
-def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: float) -> CostReport:
+def cost_report(netlist: Netlist, target: Target, found: Totals, *, bin_s: float) -> CostReport:
     """Sum an estimate up; `bin_s` is the length of a data step in seconds, at the pace of the sensor."""
-    costs = found.costs
+    costs = found.costs(target)
+    core_energies = found.core_energies(target)
     chips = chip_count(netlist.core_tile, target)
 
     def whole(reduce: Callable[[FloatArray], Any]) -> Amounts:
@@ -194,9 +195,9 @@ def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: flo
             LayerCosts(name=layer.name, amounts=_amounts(costs, chips, _mean_of(i)))
             for i, layer in enumerate(netlist.layers)
         ),
-        cores=tuple(_core(netlist, found, core) for core in range(netlist.n_cores)),
+        cores=tuple(_core(netlist, found, core_energies, core) for core in range(netlist.n_cores)),
         time=tuple(_times(table, model, times) for table, model, times in _models(found)),
-        pace=_pace(found, bin_s),
+        pace=_pace(found, costs, bin_s),
         static=tuple(
             Static(
                 source=name,
@@ -207,7 +208,7 @@ def cost_report(netlist: Netlist, target: Target, found: Estimate, *, bin_s: flo
                     StaticAtSpeed(
                         time_table=table,
                         model=model,
-                        energy_j=float((power.value * 1e-3 * times.duration_ns.sum(axis=1) * 1e-9).mean()),
+                        energy_j=float((power.value * 1e-3 * times.duration_ns * 1e-9).mean()),
                     )
                     for table, model, times in _models(found)
                 ),
@@ -281,7 +282,7 @@ def _host(target: Target, steps: float, chips: int) -> Host | None:
     )
 
 
-def _models(found: Estimate) -> Iterator[tuple[str, str, StepTimes]]:
+def _models(found: Totals) -> Iterator[tuple[str, str, Spent]]:
     """Table, model and times."""
     for table, simple in found.simple.items():
         yield table, "simple", simple
@@ -289,11 +290,12 @@ def _models(found: Estimate) -> Iterator[tuple[str, str, StepTimes]]:
         yield table, "detailed", detailed
 
 
-def _times(table: str, model: str, times: StepTimes) -> Times:
+def _times(table: str, model: str, times: Spent) -> Times:
     seconds = times.seconds
-    ran = times.critical_core >= 0
-    cores, steps = np.unique(times.critical_core[ran], return_counts=True)
-    detailed = times if isinstance(times, DetailedTimes) else None
+    steps = times.critical.sum(axis=0)
+    receiving = times.receiving.sum(axis=0)
+    ran = steps.sum()
+    detailed = times if isinstance(times, DetailedSpent) else None
     return Times(
         table=table,
         model=model,
@@ -303,24 +305,24 @@ def _times(table: str, model: str, times: StepTimes) -> Times:
             "max": float(seconds.max()),
         },
         step_s={
-            "mean": float(times.duration_ns[ran].mean() * 1e-9),
-            "max": float(times.duration_ns.max() * 1e-9),
+            "mean": float(times.duration_ns.sum() / ran * 1e-9),
+            "max": float(times.longest_ns.max() * 1e-9),
         },
         critical_core=tuple(
             CriticalCore(
                 core=int(core),
-                share_of_steps=float(count / ran.sum()),
-                receiving=float(times.receiving[times.critical_core == core].mean()),
+                share_of_steps=float(steps[core] / ran),
+                receiving=float(receiving[core] / steps[core]),
             )
-            for core, count in sorted(zip(cores, steps, strict=True), key=lambda pair: -pair[1])
+            for core in sorted(np.flatnonzero(steps), key=lambda core: -steps[core])
         ),
-        blocked_s=None if detailed is None else float(detailed.blocked_ns.sum(axis=1).mean() * 1e-9),
+        blocked_s=None if detailed is None else float(detailed.blocked_ns.mean() * 1e-9),
         peak_link_load=None if detailed is None else float(detailed.peak_load.max()),
     )
 
 
-def _pace(found: Estimate, bin_s: float) -> Pace:
-    energies = {name: each.sum(axis=1) for name, each in found.costs.energy.items()}
+def _pace(found: Totals, costs: Costs, bin_s: float) -> Pace:
+    energies = {name: each.sum(axis=1) for name, each in costs.energy.items()}
     return Pace(
         bin_s=bin_s,
         real_time_w={name: float((each / (found.steps * bin_s)).mean()) for name, each in energies.items()},
@@ -330,7 +332,7 @@ def _pace(found: Estimate, bin_s: float) -> Pace:
                 time_table=table,
                 model=model,
                 power_w=float((each / times.seconds).mean()),
-                energy_delay_js=float((each * times.duration_ns.sum(axis=1) * 1e-9).mean()),
+                energy_delay_js=float((each * times.duration_ns * 1e-9).mean()),
             )
             for table, model, times in _models(found)
             for name, each in energies.items()
@@ -338,7 +340,7 @@ def _pace(found: Estimate, bin_s: float) -> Pace:
     )
 
 
-def _core(netlist: Netlist, found: Estimate, core: int) -> CoreCosts:
+def _core(netlist: Netlist, found: Totals, energies: Mapping[str, FloatArray], core: int) -> CoreCosts:
     layers = np.unique(netlist.layer[slice(*netlist.core_compartments[core : core + 2])])
     simple = found.simple.items()
     return CoreCosts(
@@ -347,5 +349,5 @@ def _core(netlist: Netlist, found: Estimate, core: int) -> CoreCosts:
         layers=tuple(netlist.layers[i].name for i in layers),
         sweep_s={name: float(times.generation_ns[:, core].mean() * 1e-9) for name, times in simple},
         receive_s={name: float(times.processing_ns[:, core].mean() * 1e-9) for name, times in simple},
-        energy_j={name: float(each[:, core].mean()) for name, each in found.cores.items()},
+        energy_j={name: float(each[:, core].mean()) for name, each in energies.items()},
     )

@@ -50,6 +50,50 @@ class StepTimes:
         """Of each recording; shape (samples,)."""
         return np.asarray(self.duration_ns.sum(axis=1) * 1e-9)
 
+    def _spent(self, cores: int) -> dict[str, AnyArray]:
+        """Fields of :class:`Spent`."""
+        ran = self.critical_core >= 0
+        critical, receiving = (
+            np.bincount(self.critical_core[those], minlength=cores)[None] for those in (ran, self.receiving)
+        )
+        return {
+            "duration_ns": self.duration_ns.sum(axis=1),
+            "longest_ns": self.duration_ns.max(axis=1, initial=0),
+            "critical": critical,
+            "receiving": receiving,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Spent:
+    """What is kept of the steps of whole recordings, some of which were timed together, a batch."""
+
+    duration_ns: FloatArray  # (samples,) float64
+    longest_ns: FloatArray  # (samples,) float64; the longest step
+    critical: IntArray  # (batches, cores) int64; steps in which a core took longest
+    receiving: IntArray  # (batches, cores) int64; those of them in which it took longest to receive
+
+    @property
+    def seconds(self) -> FloatArray:
+        """Of each recording; shape (samples,)."""
+        return np.asarray(self.duration_ns * 1e-9)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SimpleSpent(Spent):
+    """As in :class:`SimpleTimes`."""
+
+    generation_ns: FloatArray
+    processing_ns: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DetailedSpent(Spent):
+    """Also, each (samples,) float64, how long cores were blocked, and the most messages on any link."""
+
+    blocked_ns: FloatArray
+    peak_load: FloatArray
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SimpleTimes(StepTimes):
@@ -57,6 +101,12 @@ class SimpleTimes(StepTimes):
 
     generation_ns: FloatArray
     processing_ns: FloatArray
+
+    def spent(self, cores: int) -> SimpleSpent:
+        """By recording."""
+        return SimpleSpent(
+            **self._spent(cores), generation_ns=self.generation_ns, processing_ns=self.processing_ns
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,6 +122,14 @@ class DetailedTimes(StepTimes):
     # most messages on any link at any time; one on its way counts as one spread evenly over its links and
     # its end
     peak_load: FloatArray
+
+    def spent(self, cores: int) -> DetailedSpent:
+        """By recording."""
+        return DetailedSpent(
+            **self._spent(cores),
+            blocked_ns=self.blocked_ns.sum(axis=1),
+            peak_load=self.peak_load.max(axis=1, initial=0),
+        )
 
 
 def _way(start: int, end: int, port: int, width: int, tile_links: int) -> list[int]:
