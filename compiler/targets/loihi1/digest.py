@@ -5,14 +5,14 @@ follow from the checkpoint. Digests show that they are those that the compiler c
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from spikeloom.compiler.ir import added_up
 from spikeloom.compiler.passes.prune import of_source, zeroed
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
-from spikeloom.compiler.types import BoolArray
+from spikeloom.compiler.types import AnyArray, BoolArray
 
 DIGITS = 16
 """Hexadecimal digits of a digest."""
@@ -29,9 +29,11 @@ def digests(network: IntegerNetwork, gone: Sequence[BoolArray]) -> dict[str, dic
         synapses = []
         into = added_up((p.pre, p.effective()) for p in network.projections if p.post == post)
         for pre, weight in sorted(into.items()):
-            part = zeroed(weight, gone[post], of_source(gone, pre, weight.shape[1])).copy()
-            part.eliminate_zeros()
-            part.sort_indices()
+            part = zeroed(weight, gone[post], of_source(gone, pre, weight.shape[1]))
+            if not (part.has_sorted_indices and part.data.all()):
+                part = part.copy()
+                part.eliminate_zeros()
+                part.sort_indices()
             synapses += [np.array(pre), part.indptr, part.indices, part.data] if part.nnz else []
         parts = {
             "neurons": [kept],
@@ -39,8 +41,13 @@ def digests(network: IntegerNetwork, gone: Sequence[BoolArray]) -> dict[str, dic
             "weights": synapses,
             "biases": [population.bias[kept]],
         }
-        by_layer[population.name] = {
-            what: hashlib.sha256(b"".join(a.astype("<i4").tobytes() for a in arrays)).hexdigest()[:DIGITS]
-            for what, arrays in parts.items()
-        }
+        by_layer[population.name] = {what: _digest(arrays) for what, arrays in parts.items()}
     return by_layer
+
+
+def _digest(arrays: Iterable[AnyArray]) -> str:
+    """Of numbers at four bytes each."""
+    running = hashlib.sha256()
+    for array in arrays:
+        running.update(np.ascontiguousarray(array, "<i4").data)
+    return running.hexdigest()[:DIGITS]

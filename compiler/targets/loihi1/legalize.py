@@ -176,23 +176,28 @@ def _faults(netlist: Netlist, target: Target) -> Iterator[Violation]:
             name = f"{target.name}.{rule}"
             words = ", ".join(map(str, allowed))
             yield Violation(owner="synapse formats", rule=name, used=str(value), allowed=words, remedy=again)
-    form = np.repeat(netlist.axon_format.astype(np.int32), np.diff(netlist.axon_synapses))
-    # narrow, for there may be millions of synapses
-    step = (1 << WEIGHT_BITS - netlist.format_weight_bits).astype(np.int16)[form]
-    index = netlist.format_index_bits.astype(np.int8)[form]
-    wide = netlist.synapse_weight % step != 0
-    far = (index > 0) & (netlist.synapse_target >> index > 0)
-    for rule, broken, values in (
-        ("synapse.weight_bits", wide, netlist.synapse_weight),
-        ("synapse.index_bits", far, netlist.synapse_target),
-    ):
-        if broken.any():
-            first = int(np.argmax(broken))
+    step = 1 << WEIGHT_BITS - netlist.format_weight_bits
+    found: dict[str, list[IntArray]] = {"synapse.weight_bits": [], "synapse.index_bits": []}
+    for axons in map(slice, netlist.core_axons[:-1].tolist(), netlist.core_axons[1:].tolist()):
+        ends = netlist.axon_synapses[axons.start : axons.stop + 1]
+        part = slice(ends[0], ends[-1])
+        form = np.repeat(netlist.axon_format[axons], np.diff(ends))
+        index = netlist.format_index_bits[form]
+        wide = netlist.synapse_weight[part] % step[form] != 0
+        far = (index > 0) & (netlist.synapse_target[part] >> index > 0)
+        for rule, broken in zip(found, (wide, far), strict=True):
+            found[rule].append(ends[0] + np.flatnonzero(broken))
+    values = {"synapse.weight_bits": netlist.synapse_weight, "synapse.index_bits": netlist.synapse_target}
+    for rule, parts in found.items():
+        places = np.concatenate(parts)
+        if len(places):
+            first = int(places[0])
+            axon = np.searchsorted(netlist.axon_synapses, first, side="right") - 1
             yield Violation(
-                owner=f"synapse {first} (and {np.count_nonzero(broken) - 1} more)",
+                owner=f"synapse {first} (and {len(places) - 1} more)",
                 rule=f"{target.name}.{rule}",
-                used=str(values[first]),
-                allowed=f"what {columns[rule][form[first]]} bits hold",
+                used=str(values[rule][first]),
+                allowed=f"what {columns[rule][netlist.axon_format[axon]]} bits hold",
                 remedy=again,
             )
 

@@ -4,11 +4,11 @@ Nothing is changed. Neurons are looked at in *chunks*, runs of neighbours of one
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from spikeloom.compiler.ir import INPUT
+from spikeloom.compiler.ir import INPUT, Sparse
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerProjection
 from spikeloom.compiler.targets.loihi1.legalize import list_words, stored_once
@@ -19,6 +19,9 @@ SPARSE_SHARE = 0.75
 
 ADDED = ("core.compartments", "core.axons_in", "core.axons_out")
 """Limits of which a core uses as much as its chunks do together."""
+
+FEW = 16
+"""Neurons of which the input axons are counted first."""
 
 SynapseFormat = tuple[int, int, int]
 """Weight bits, exponent and index bits (0 if dense)."""
@@ -56,6 +59,14 @@ class Lists:
     mantissa: IntArray  # (synapses,); non-zero weight
     first: IntArray  # (lists,) int64; first row of each list
     last: IntArray  # (lists,) int64; last row of each list
+
+
+def sources_of(weight: Sparse, chunk: Chunk) -> IntArray:
+    """Neurons that a chunk hears through some weights, (sources,) int64."""
+    synapses = slice(*weight.indptr[[chunk.first, chunk.last]].tolist())
+    heard = np.zeros(weight.shape[1], np.bool_)
+    heard[weight.indices[synapses][weight.data[synapses] != 0]] = True
+    return np.flatnonzero(heard)
 
 
 def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
@@ -136,6 +147,18 @@ class Needs:
         if chunk not in self._lists:
             self._lists[chunk] = self._first_of_longest(chunk) or lists_into(self.network, chunk)
         return self._lists[chunk]
+
+    def too_long(self, longest: Chunk) -> int:
+        """A size from which on chunks that begin as this one have too many input axons; counted without lists."""
+        limit = self.target.limit("core.axons_in")
+        weights = [each.weight for each in self.network.projections if each.post == longest.population]
+        size = FEW
+        while size <= longest.size:
+            chunk = replace(longest, last=longest.first + size)
+            if sum(len(sources_of(weight, chunk)) for weight in weights) > limit:
+                return size
+            size *= 2
+        return longest.size + 1
 
     def look_ahead(self, longest: Chunk) -> None:
         """Chunks that begin as this one and are shorter are asked about next."""
@@ -226,7 +249,10 @@ class Needs:
     def lean(self, chunks: Core) -> bool:
         """Whether such a core has room for lists of few visited synapses; its output axons do not matter."""
         if chunks not in self._lean:
-            self._lean[chunks] = self.excess(chunks, lean=True).keys() <= {"core.axons_out"}
+            self._lean[chunks] = any(
+                self.excess(chunks, lean=True, unrolled=unrolled).keys() <= {"core.axons_out"}
+                for unrolled in (True, False)
+            )
         return self._lean[chunks]
 
     def forget(self) -> None:

@@ -57,8 +57,14 @@ def _fill(needs: Needs, population: int) -> list[Chunk]:
     chunks: list[Chunk] = []
     first = 0
     while first < size:
+        ends = range(first + 1, min(size, first + needs.target.limit("core.compartments")) + 1)
+        too_long = needs.too_long(Chunk(population=population, first=first, last=ends.stop - 1))
+        longest = min(ends.stop, first + too_long) - 1
+        needs.look_ahead(Chunk(population=population, first=first, last=longest))
 
-        def exceeds(last: int, first: int = first) -> bool:
+        def exceeds(last: int, first: int = first, too_long: int = too_long) -> bool:
+            if last - first >= too_long:
+                return True
             tried = Chunk(population=population, first=first, last=last)
             broken = not needs.fits((tried,))
             needs.drop(tried)
@@ -67,12 +73,11 @@ def _fill(needs: Needs, population: int) -> list[Chunk]:
         # A larger chunk needs more of every limit but synapse formats (all its lists may be dense) and
         # memory (more of them may be alike); there a smaller chunk than the largest may come out, which fits
         # as well.
-        ends = range(first + 1, min(size, first + needs.target.limit("core.compartments")) + 1)
-        needs.look_ahead(Chunk(population=population, first=first, last=ends.stop - 1))
         fitting = bisect_left(ends, True, key=exceeds)
         if not fitting:
             raise CapacityError(_worst(needs, population))
         chunks.append(Chunk(population=population, first=first, last=ends[fitting - 1]))
+        needs.lists(chunks[-1])  # now, while those that they begin are there
         first = chunks[-1].last
     return chunks
 

@@ -20,7 +20,7 @@ from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.ir import INPUT
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
-from spikeloom.compiler.targets.loihi1.layout.core_needs import Cores, lists_into
+from spikeloom.compiler.targets.loihi1.layout.core_needs import Cores, sources_of
 from spikeloom.compiler.types import FloatArray, IntArray
 
 STARTS = 16
@@ -53,11 +53,12 @@ def core_traffic(network: IntegerNetwork, cores: Cores, rates: tuple[FloatArray,
     traffic = np.zeros((len(cores),) * 2)
     for core, chunks in enumerate(cores):
         for chunk in chunks:
-            for lists in lists_into(network, chunk):
-                pre = network.projections[lists.projection].pre
-                if pre != INPUT:
-                    rate = rates[pre][lists.source] if rates is not None else np.ones(len(lists.source))
-                    np.add.at(traffic[:, core], core_of[pre][lists.source], rate)
+            for projection in network.projections:
+                pre = projection.pre
+                if projection.post == chunk.population and pre != INPUT:
+                    sources = sources_of(projection.weight, chunk)
+                    rate = rates[pre][sources] if rates is not None else np.ones(len(sources))
+                    np.add.at(traffic[:, core], core_of[pre][sources], rate)
     return traffic
 
 
