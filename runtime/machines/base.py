@@ -393,7 +393,7 @@ class Machine(ABC):
             channels = with_clocks(events[rows], self.netlist.clocks)
             trace, total = pricing.run(channels, None if lengths is None else lengths[rows])
             ran = self._run(trace)
-            runs.append(ran if counts else replace(ran, counts=ran.counts[:0]))
+            runs.append(ran if counts else replace(ran, counts=ran.counts[:0].copy()))
             totals.append(total)
             if progress is not None:
                 progress(rows.stop)

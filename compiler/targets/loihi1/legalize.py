@@ -187,7 +187,7 @@ def _faults(netlist: Netlist, target: Target) -> Iterator[Violation]:
         far = (index > 0) & (netlist.synapse_target[part] >> index > 0)
         for rule, broken in zip(found, (wide, far), strict=True):
             found[rule].append(ends[0] + np.flatnonzero(broken))
-    values = {"synapse.weight_bits": netlist.synapse_weight, "synapse.index_bits": netlist.synapse_target}
+    held = {"synapse.weight_bits": netlist.synapse_weight, "synapse.index_bits": netlist.synapse_target}
     for rule, parts in found.items():
         places = np.concatenate(parts)
         if len(places):
@@ -196,7 +196,7 @@ def _faults(netlist: Netlist, target: Target) -> Iterator[Violation]:
             yield Violation(
                 owner=f"synapse {first} (and {len(places) - 1} more)",
                 rule=f"{target.name}.{rule}",
-                used=str(values[rule][first]),
+                used=str(held[rule][first]),
                 allowed=f"what {columns[rule][netlist.axon_format[axon]]} bits hold",
                 remedy=again,
             )
