@@ -159,10 +159,10 @@ class Recordings:
 
     def changed(self, steps: int, change: Change, lengths: IntArray | None) -> Self:
         """The same recordings with other events, of so many steps, and lengths."""
-        held = self.held
-        if isinstance(held, Stored):
-            return replace(self, held=held.changed(steps, change), lengths=lengths)
-        return replace(self, held=change(held, range(len(self))), lengths=lengths)
+        events = self.held
+        if isinstance(events, Stored):
+            return replace(self, held=events.changed(steps, change), lengths=lengths)
+        return replace(self, held=change(events, range(len(self))), lengths=lengths)
 
     def identity(self) -> dict[str, Any]:
         """Arrays that tell these recordings from others, whatever their names."""

@@ -170,14 +170,14 @@ def _faults(netlist: Netlist, target: Target) -> Iterator[Violation]:
         "synapse.index_bits": netlist.format_index_bits,
         "synapse.exponent": netlist.format_exponent,
     }
-    for rule, values in columns.items():
+    for rule, column in columns.items():
         allowed = target.choices[rule]
-        for value in np.setdiff1d(values, allowed).tolist():
+        for value in np.setdiff1d(column, allowed).tolist():
             name = f"{target.name}.{rule}"
             words = ", ".join(map(str, allowed))
             yield Violation(owner="synapse formats", rule=name, used=str(value), allowed=words, remedy=again)
     step = 1 << WEIGHT_BITS - netlist.format_weight_bits
-    found: dict[str, list[IntArray]] = {"synapse.weight_bits": [], "synapse.index_bits": []}
+    beyond: dict[str, list[IntArray]] = {"synapse.weight_bits": [], "synapse.index_bits": []}
     for axons in map(slice, netlist.core_axons[:-1].tolist(), netlist.core_axons[1:].tolist()):
         ends = netlist.axon_synapses[axons.start : axons.stop + 1]
         part = slice(ends[0], ends[-1])
@@ -185,10 +185,10 @@ def _faults(netlist: Netlist, target: Target) -> Iterator[Violation]:
         index = netlist.format_index_bits[form]
         wide = netlist.synapse_weight[part] % step[form] != 0
         far = (index > 0) & (netlist.synapse_target[part] >> index > 0)
-        for rule, broken in zip(found, (wide, far), strict=True):
-            found[rule].append(ends[0] + np.flatnonzero(broken))
-    held = {"synapse.weight_bits": netlist.synapse_weight, "synapse.index_bits": netlist.synapse_target}
-    for rule, parts in found.items():
+        for rule, broken in zip(beyond, (wide, far), strict=True):
+            beyond[rule].append(ends[0] + np.flatnonzero(broken))
+    values = {"synapse.weight_bits": netlist.synapse_weight, "synapse.index_bits": netlist.synapse_target}
+    for rule, parts in beyond.items():
         places = np.concatenate(parts)
         if len(places):
             first = int(places[0])
@@ -196,7 +196,7 @@ def _faults(netlist: Netlist, target: Target) -> Iterator[Violation]:
             yield Violation(
                 owner=f"synapse {first} (and {len(places) - 1} more)",
                 rule=f"{target.name}.{rule}",
-                used=str(held[rule][first]),
+                used=str(values[rule][first]),
                 allowed=f"what {columns[rule][netlist.axon_format[axon]]} bits hold",
                 remedy=again,
             )
