@@ -17,7 +17,7 @@ from typing import IO, Any
 import numpy as np
 
 from spikeloom.compiler.errors import DataError, OptionError
-from spikeloom.compiler.types import AnyArray, BoolArray, EventArray, IntArray
+from spikeloom.compiler.types import AnyArray, EventArray, IntArray
 from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.arrays import Binned, bins_joined, one_width, read_binned
 from spikeloom.models.recordings.classes import numbered
@@ -28,12 +28,9 @@ from spikeloom.models.recordings.eventfiles import EventStream, read_stream
 from spikeloom.models.recordings.evtouch import BIN_S
 from spikeloom.models.recordings.fetch import DATA_SETS, find_data
 from spikeloom.models.recordings.single import (
-    SEVERAL,
     Single,
-    length_notes,
-    polarity_notes,
+    event_notes,
     silent_notes,
-    taxel_notes,
     unit_notes,
     width_notes,
 )
@@ -123,9 +120,7 @@ def load_data(
         bin_s=width,
         groups=groups_of(source, [name for name, _ in chosen], [row.groups for row in rows], groups),
     )
-    heard, ends = _heard(data)
-    notes += taxel_notes(source, heard.any(axis=1)) if taxels is None else []
-    notes += [*length_notes(source, ends, steps), *polarity_notes(read, source, heard.any(axis=0))]
+    notes += event_notes(data, read, taxels)
     notes += group_notes(source, [row.groups for row in rows]) if groups is None else []
     return data if released and not notes else replace(data, counts=_sum_counts(read, steps, notes))
 
@@ -369,29 +364,6 @@ def _flat(members: evtouch.Members) -> dict[str, dict[str, str]]:
     """Recordings that are in no split."""
     flat = {name: name for name in members if "/" not in name and not name.startswith(".")}
     return {"": flat} if flat else {}
-
-
-def _heard(recordings: evtouch.Recordings) -> tuple[BoolArray, IntArray]:
-    """Channels (taxels, polarities) with an event, and the step after the last event of each recording (samples,)."""
-    heard = np.zeros(recordings.held.shape[1:3], np.bool_)
-    ends = []
-    for part in recordings.parts():
-        heard |= part.events.any(axis=(0, 3))
-        busy = part.events.any(axis=(1, 2))
-        ends.append(np.where(busy, np.arange(1, busy.shape[1] + 1), 0).max(axis=1))
-    return heard, np.concatenate(ends)
-
-
-def other_sensor(recordings: evtouch.Recordings) -> str | None:
-    """Note that events are of a smaller sensor: in many recordings the last quarter of the taxels has none."""
-    last = int(np.flatnonzero(_heard(recordings)[0].any(axis=1)).max(initial=-1))
-    if (
-        recordings.bin_s is None
-        or len(recordings) < SEVERAL
-        or 4 * (recordings.taxels - 1 - last) <= recordings.taxels
-    ):
-        return None
-    return f"{recordings.source}: has events of taxels 0..{last} only, the network has {recordings.taxels}"
 
 
 def _read(

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spikeloom.compiler.types import BoolArray, IntArray
+from spikeloom.compiler.types import AnyArray, BoolArray, IntArray
 from spikeloom.models.recordings.counts import EventCounts, number
-from spikeloom.models.recordings.evtouch import BIN_S, WIDTH
+from spikeloom.models.recordings.evtouch import BIN_S, WIDTH, Recordings
 
 SEVERAL = 8
 """Recordings from which on what none of them has tells something."""
@@ -58,25 +58,44 @@ def width_notes(read: Sequence[Single], names: Sequence[str], source: str) -> li
     return [f"{line}; write the seconds to {WIDTH} beside them"] if guessed else []
 
 
-def length_notes(source: str, ends: IntArray, steps: IntArray) -> list[str]:
-    """Lengths (samples,) in a smaller unit leave nearly all of every recording silent, whose events end there."""
-    if (SILENT * ends >= steps).any():
-        return []
-    return [f"{source}: no event after a tenth of each recording: are the lengths right, in seconds?"]
+def heard(recordings: Recordings) -> tuple[BoolArray, IntArray]:
+    """Channels (taxels, polarities) with an event, and the step after the last event of each recording (samples,)."""
+    channels = np.zeros(recordings.held.shape[1:3], np.bool_)
+    ends = []
+    for part in recordings.parts():
+        channels |= part.events.any(axis=(0, 3))
+        busy = part.events.any(axis=(1, 2))
+        ends.append(np.where(busy, np.arange(1, busy.shape[1] + 1), 0).max(axis=1))
+    return channels, np.concatenate(ends)
 
 
-def polarity_notes(read: Sequence[Single], source: str, heard: BoolArray) -> list[str]:
-    """A polarity that nothing has, of those (polarities,) `heard`, among several recordings that came as events."""
-    none = np.flatnonzero(~heard)
-    if len(read) < SEVERAL or not all(each.sent for each in read) or not len(none):
-        return []
-    return [f"{source}: no event of polarity {none[0]} in {number(len(read), 'recording')}"]
+def event_notes(recordings: Recordings, read: Sequence[Single], taxels: int | None) -> list[str]:
+    """What is odd about where and when there are events; taxels that are not `taxels` of a network were counted."""
+    channels, ends = heard(recordings)
+    notes = [] if taxels is not None else _taxel_notes(channels.any(axis=1))
+    if (SILENT * ends < recordings.step_counts).all():
+        notes += ["no event after a tenth of each recording: are the lengths right, in seconds?"]
+    silent = np.flatnonzero(~channels.any(axis=0))
+    if len(read) >= SEVERAL and all(each.sent for each in read) and len(silent):
+        notes += [f"no event of polarity {silent[0]} in {number(len(read), 'recording')}"]
+    return [f"{recordings.source}: {note}" for note in notes]
 
 
-def taxel_notes(source: str, alive: BoolArray) -> list[str]:
+def _taxel_notes(alive: AnyArray) -> list[str]:
     """Taxels that count from 1 leave the first silent, and no other; those (taxels,) that are `alive` have events."""
     if len(alive) < 4 or alive[0] or not alive[1:].all():
         return []
-    return [
-        f"{source}: no event at taxel 0, some at each of 1..{len(alive) - 1}: if these count from 1, count from 0"
-    ]
+    return [f"no event at taxel 0, some at each of 1..{len(alive) - 1}: if these count from 1, count from 0"]
+
+
+def other_sensor(recordings: Recordings) -> str | None:
+    """Note that events are of a smaller sensor: in many recordings the last quarter of the taxels has none."""
+    channels, _ = heard(recordings)
+    last = int(np.flatnonzero(channels.any(axis=1)).max(initial=-1))
+    if (
+        recordings.bin_s is None
+        or len(recordings) < SEVERAL
+        or 4 * (recordings.taxels - 1 - last) <= recordings.taxels
+    ):
+        return None
+    return f"{recordings.source}: has events of taxels 0..{last} only, the network has {recordings.taxels}"

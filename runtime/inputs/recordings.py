@@ -25,6 +25,7 @@ from spikeloom.models.recordings.evtouch import (
     parse_window,
 )
 from spikeloom.models.recordings.grasps import SYNTHETIC, synthetic_split
+from spikeloom.models.recordings.single import other_sensor
 from spikeloom.runtime.report.console import progress, tell
 from spikeloom.runtime.requests.choices import SplitChoice
 
@@ -131,7 +132,7 @@ def _require_width(data: Recordings, own: float | None, remedy: str) -> None:
 
 def _require_sensor(data: Recordings, split: str, taxels: int | None) -> None:
     """Refuse training recordings that look like another sensor's, warn of others."""
-    if taxels is not None and (why := events.other_sensor(data)) is not None:
+    if taxels is not None and (why := other_sensor(data)) is not None:
         if split == "train":
             raise DataError(
                 f"{why}; give the graph of their sensor (--taxels), or recordings of the network's"
