@@ -72,7 +72,7 @@ def heard(recordings: Recordings) -> tuple[BoolArray, IntArray]:
 def event_notes(recordings: Recordings, read: Sequence[Single], taxels: int | None) -> list[str]:
     """What is odd about where and when there are events; taxels that are not `taxels` of a network were counted."""
     channels, ends = heard(recordings)
-    notes = [] if taxels is not None else _taxel_notes(channels.any(axis=1))
+    notes = [] if taxels is not None else _taxel_notes(np.asarray(channels.any(axis=1)))
     if (SILENT * ends < recordings.step_counts).all():
         notes += ["no event after a tenth of each recording: are the lengths right, in seconds?"]
     silent = np.flatnonzero(~channels.any(axis=0))
