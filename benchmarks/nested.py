@@ -99,7 +99,7 @@ def whole(path: str, taxels: int | None = None) -> tuple[Recordings, int]:
     events = [np.pad(each.events, [(0, 0)] * 3 + [(0, steps - each.steps)]) for each in (training, test)]
     both = replace(
         training,
-        events=np.concatenate(events),
+        held=np.concatenate(events),
         lengths=None
         if training.lengths is None is test.lengths
         else np.concatenate([training.step_counts, test.step_counts]),
