@@ -56,55 +56,65 @@ def recordings(
 
     Raises DataError or OptionError if they cannot be used, or do not suit the network.
     """
-    trained_bin = (trained or {}).get("bin_s")
+    trained = trained or {}
     known = None if classes is None else names_of(trained, classes)
     wanted = None if groups is None else [name.strip() for name in groups.split(",")]
     if isinstance(path, Recordings):
         given = path if known is None else renamed(path, known)
-        _warn_of_steps(given, trained or {})
         require_suited(given, classes=classes, taxels=taxels)
-        _require_width(given, trained_bin, f"read them with recordings(…, bin={trained_bin})")
-        data = first_part(with_groups(_first(given, limit), wanted), (trained or {}).get("window", WHOLE))
-        _warn_of_training(data, trained or {})
-        warn_of_few(data, bins)
-        return events.joined_bins(data if labels_for is None else events.need_labels(data, labels_for), bins)
-    if path != SYNTHETIC:
-        _require_asked(bin_s, trained_bin)
-        data = events.load_data(
-            path,
-            split,
-            bin_s=bin_s,
-            default_bin_s=trained_bin,
-            names=known,
-            limit=limit,
-            classes=classes,
-            taxels=taxels,
-            groups=wanted,
-        )
-        said = f"write their seconds to {WIDTH} beside them, or give --bin {trained_bin}"
-        _require_width(
-            data, trained_bin, said if data.bin_s is None else "give the events that they were made of"
-        )
-        _require_sensor(data, split, taxels)
-        show_counts(data.source, data.split, data.counts)
-        if labels_for is not None:
-            events.need_labels(data, labels_for)
-    else:
-        events.require_events(SYNTHETIC, bin_s)
-        data = with_groups(synthetic_split(split, limit=limit), wanted)
+        bins_s = trained.get("bin_s")
+        _require_width(given, bins_s, f"read them with recordings(…, bin={bins_s})")
+        data = with_groups(_first(given, limit), wanted)
+    elif path == SYNTHETIC:
+        data = _synthetic(split, limit, wanted, bin_s, trained)
         require_suited(data, classes=classes, taxels=taxels)
-        _require_width(data, trained_bin, "give recordings in such bins")
-    if classes is not None:
-        _warn_of_others(data, trained or {}, classes, whole=limit is None)
-        if split == "train" and limit is None:
-            warn_of_missing(data, range(classes))
-    elif labels_for is not None:
-        (data,) = without_gaps(data)
-    data = first_part(data, (trained or {}).get("window", WHOLE))
-    _warn_of_training(data, trained or {})
-    _warn_of_steps(data, trained or {})
+    else:
+        options: dict[str, Any] = {"names": known, "limit": limit, "classes": classes, "groups": wanted}
+        data = _read(path, split, bin_s, trained, taxels=taxels, **options)
+    if labels_for is not None:
+        events.need_labels(data, labels_for)
+    if not isinstance(path, Recordings):
+        if classes is not None:
+            _warn_of_others(data, trained, classes, whole=limit is None)
+            if split == "train" and limit is None:
+                warn_of_missing(data, range(classes))
+        elif labels_for is not None:
+            (data,) = without_gaps(data)
+    data = first_part(data, trained.get("window", WHOLE))
+    _warn_of_training(data, trained)
+    _warn_of_steps(data, trained)
     warn_of_few(data, bins)
     return events.joined_bins(data, bins)
+
+
+def _synthetic(
+    split: str, limit: int | None, groups: list[str] | None, bin_s: float | None, trained: Mapping[str, Any]
+) -> Recordings:
+    """The package's own recordings."""
+    events.require_events(SYNTHETIC, bin_s)
+    data = with_groups(synthetic_split(split, limit=limit), groups)
+    _require_width(data, trained.get("bin_s"), "give recordings in such bins")
+    return data
+
+
+def _read(
+    path: str,
+    split: str,
+    bin_s: float | None,
+    trained: Mapping[str, Any],
+    *,
+    taxels: int | None,
+    **options: Any,
+) -> Recordings:
+    """Recordings of a path, whose disorder goes to stderr; `options` are those of `load_data`."""
+    bins_s = trained.get("bin_s")
+    _require_asked(bin_s, bins_s)
+    data = events.load_data(path, split, bin_s=bin_s, default_bin_s=bins_s, taxels=taxels, **options)
+    remedy = f"write their seconds to {WIDTH} beside them, or give --bin {bins_s}"
+    _require_width(data, bins_s, remedy if data.bin_s is None else "give the events that they were made of")
+    _require_sensor(data, split, taxels)
+    show_counts(data.source, data.split, data.counts)
+    return data
 
 
 def _first(data: Recordings, limit: int | None) -> Recordings:

@@ -85,8 +85,8 @@ def join(request: JoinRequest) -> Joined:
 
 def _warn_of_twice(records: Sequence[Sequence[Mapping[str, Any]]]) -> None:
     """Say on stderr that two of what is joined hold one network, by the towers of each."""
-    held = [{(tower["sha256"], tower["weights"]) for tower in each} for each in records]
-    if len(set().union(*held)) < sum(map(len, held)):
+    networks = [{(tower["sha256"], tower["weights"]) for tower in each} for each in records]
+    if len(set().union(*networks)) < sum(map(len, networks)):
         tell("warning: join: one network stands there twice: its votes count twice; join other seeds")
 
 
