@@ -180,13 +180,27 @@ class AbacusMachine(Machine):
     def spec_and_engine(self, channels):
         return specification(self.netlist, channels), simulate(self.netlist, channels[None])
 
-    def priced(self, channels, lengths, chip, bin_s, detail, progress):
+    def pricing(self, chip, detail):
+        return Pricing(self.netlist, chip)
+
+
+@dataclass(frozen=True)
+class Pricing:
+    netlist: Beads
+    chip: Target
+
+    def batch(self, steps):
+        return max(1, (1 << 20) // steps)
+
+    def run(self, channels, lengths):
         trace = simulate(self.netlist, channels, lengths)
-        spikes = trace.counts.spikes.sum(axis=1)
-        energy = {table.name: spikes * table.joule("spike") for table in chip.energy}
+        return trace, trace.counts.spikes.sum(axis=1)
+
+    def price(self, spikes, bin_s):
+        energy = {table.name: spikes * table.joule("spike") for table in self.chip.energy}
         means = {"per_inference": {"energy_j": {name: each.mean() for name, each in energy.items()}}}
         page = [Section("Costs", [Text(f"{spikes.mean():g} beads moved an inference")])]
-        return trace, Price(
+        return Price(
             synaptic_operations=spikes,
             energy_j=energy,
             dynamic_j=energy,
