@@ -13,6 +13,7 @@ from spikeloom.compiler.targets.loihi1.integers import run_integer
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
+from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.loihi1 import compiled
 from spikeloom.runtime.report.sections import terminal
 
@@ -74,3 +75,52 @@ def test_what_makes_up_for_the_memory_comes_back_from_an_export(tmp_path):
     assert_array_equal(back.populations[0].bias, integer.populations[0].bias)
     given = events()
     assert_array_equal(run_integer(back, given).spikes[0], run_integer(integer, given).spikes[0])
+
+
+def test_ties_of_neurons_beside_one_without_whole_weights_are_counted():
+    weight = [[1.0, 2.0, -1.0], [np.pi, np.e, -1.0]]
+    done = compile_network(
+        nets.chain(weight, beta=0.0, theta=2.0), Options(storage=Fixed((Packing(planes=3),)))
+    )
+    assert done.choices[0].ties == 1
+
+
+def test_ties_of_weights_that_are_thirds_are_counted_where_they_are_moved():
+    weight = np.array([[1.0, 2.0, 4.0], [2.0, 4.0, 1.0], [3.0, 3.0, 3.0]])
+    given = events()[..., :3]
+    network = nets.chain(weight * [[1], [2 / 3], [2 / 3]], beta=0.0, theta=2.0)
+    done = compile_network(network, Options(storage=Fixed((Packing(),))))
+    fired = run_integer(lift(done.netlist), given).spikes[0]
+    moved = np.any(fired != (given @ weight.T > [2, 3, 3]), axis=(0, 1))
+    assert moved.any()
+    assert done.choices[0].ties >= np.count_nonzero(moved)
+
+
+def test_a_threshold_just_below_a_multiple_of_the_weights_is_that_multiple():
+    theta = 0.7 + 0.7 + 0.7  # 2.0999999999999996
+    network = nets.chain([[0.7, 0.7, 0.7, 0.7]], beta=1.0, theta=theta)
+    done = compile_network(network, Options(storage=Fixed((Packing(),))))
+    integer = lift(done.netlist)
+    stored = integer.projections[0].effective().data
+    assert np.all(3 * stored == integer.populations[0].threshold)
+
+
+def test_a_bias_that_makes_up_for_the_memory_is_the_checkpoints():
+    network = nets.chain([[1.0, 1.0, 1.0, 1.0], [1.0, -1.0, -1.0, 0.0]], beta=0.0, theta=1.0)
+    done = compile_network(network, Options(storage=Fixed((Packing(),))))
+    assert np.any(lift(done.netlist).populations[0].bias != 0)
+    assert machine_of(done.netlist).check_lowering(network).holds
+
+
+def test_ties_that_a_bias_adds_up_to_are_counted_where_they_are_moved():
+    network = nets.chain([[1.0, 2.0, -1.0]], beta=1.0, theta=2.0, biases=[np.array([1.0])])
+    given = events()[..., :3]
+    coarse = compile_network(network, Options(storage=Fixed((Packing(bits=2),))))
+    moved = run_integer(lift(coarse.netlist), given).spikes[0] != run_float(network, given).spikes[0]
+    assert np.any(moved)
+    assert coarse.choices[0].ties == 1
+    plain = compile_network(network, Options(storage=Fixed((Packing(),))))
+    assert_array_equal(
+        run_integer(lift(plain.netlist), given).spikes[0], run_float(network, given).spikes[0]
+    )
+    assert not plain.choices[0].ties

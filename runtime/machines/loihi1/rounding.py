@@ -33,6 +33,7 @@ from spikeloom.compiler.targets.loihi1.idle import forgotten
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerProjection
 from spikeloom.compiler.targets.loihi1.legalize import require_legal
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
+from spikeloom.compiler.targets.loihi1.storage.ties import remainders
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 
@@ -299,11 +300,15 @@ def _wrong_numbers(
     bias = np.clip(wanted.bias * unit, -BIAS_LIMIT, BIAS_LIMIT)
     coarse = 0.5 * (1 << np.maximum(registers.encode_bias(bias)[1], chip.bias_exponent)) * SLACK
     above = below = coarse
+    if not wanted.beta and not wanted.alpha:  # the bias makes up for what a membrane keeps all the same
+        most, least = remainders(chip, [p for p in integer.projections if p.post == post])
+        above = above + least
+        below = below + most
     if compensates and weights.wrong <= MOVED * weights.count:
         # where no weight was moved, the bias takes up what the nearest ones lose
         shift = sum(NUDGES) * wanted.theta * unit
-        above = weights.lost * (1 << registers.MEMBRANE_SHIFT) * SLACK + shift + coarse
-        below = weights.gained * (1 << registers.MEMBRANE_SHIFT) * SLACK + shift + coarse
+        above = weights.lost * (1 << registers.MEMBRANE_SHIFT) * SLACK + shift + above
+        below = weights.gained * (1 << registers.MEMBRANE_SHIFT) * SLACK + shift + below
     error = chip.bias - bias
     present = ~silence.absent[post]
     wrong = present & ((error > above) | (-error > below)) & ~(silence.zeroed[post] & (chip.bias == 0))

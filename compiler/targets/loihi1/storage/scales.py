@@ -156,7 +156,10 @@ def fit(layer: FloatLayer, bits: int, exponents: tuple[int, ...], mantissa_scale
         # reaches
         return stored, np.inf if stored is None else stored.reached
 
-    high = int(min(population.theta * mantissa_scale * 2.0 ** exponents[0], _largest_threshold(population)))
+    finest = population.theta * mantissa_scale * 2.0 ** exponents[0]
+    high = int(
+        min(finest * (1 + 1e-12), _largest_threshold(population))
+    )  # a product just below a whole number
     if high < 1:
         return None
     stored, over = at(high)

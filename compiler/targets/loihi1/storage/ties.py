@@ -5,7 +5,7 @@ between two of them and decides the same. A membrane that is to keep nothing kee
 up for where that is less than a step.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy import sparse
 
 from spikeloom.compiler.ir import Sparse, added_up
 from spikeloom.compiler.targets.loihi1.bounds import extreme_membranes, one_sided
-from spikeloom.compiler.targets.loihi1.integers import IntegerPopulation
+from spikeloom.compiler.targets.loihi1.integers import IntegerPopulation, IntegerProjection
 from spikeloom.compiler.targets.loihi1.registers import (
     BIAS_EXPONENT_MAX,
     BIAS_MANTISSA_MAX,
@@ -24,8 +24,14 @@ from spikeloom.compiler.targets.loihi1.registers import (
 from spikeloom.compiler.targets.loihi1.storage.scales import FloatLayer, Rounded
 from spikeloom.compiler.types import BoolArray, IntArray
 
-WHOLE = 2.0**20
-"""Real weights that are multiples of one part of so many can add up to a threshold exactly."""
+WHOLE = 2.0**20 * 3**2 * 5 * 7 * 11 * 13
+"""Real weights that are multiples of one part of so many can add up to a threshold exactly.
+
+A reader that brings neurons to one threshold leaves whole weights as thirds, fifths and so on.
+"""
+
+CLOSE = 2.0**-48
+"""A number this close to a whole one, as a share of it, is that, but for the rounding of float64."""
 
 COARSE = 2**10
 """Weights up to so many steps count as of few values: sums of finer ones meet a threshold by chance alone."""
@@ -41,11 +47,40 @@ def _steps(weights: Mapping[int, Sparse]) -> IntArray:
     return step
 
 
+def _whole(layer: FloatLayer) -> tuple[dict[int, Sparse], IntArray, BoolArray]:
+    """Weights from each source, biases, and which neurons have whole numbers alone, in parts of ``WHOLE``.
+
+    No weights and biases of other neurons.
+    """
+    bias = layer.population.bias * WHOLE
+    whole = np.abs(bias - np.rint(bias)) <= CLOSE * np.abs(bias)
+    floats = added_up((p.pre, p.weight * WHOLE) for p in layer.projections)
+    for weight in floats.values():
+        apart = abs(weight - weight.rint()) - CLOSE * abs(weight)
+        whole &= apart.max(axis=1).toarray().ravel() <= 0
+        whole &= abs(weight).max(axis=1).toarray().ravel() < 2**62
+    kept = sparse.diags_array(whole.astype(np.float64))
+    weights = {pre: (kept @ weight.rint()).tocsr() for pre, weight in floats.items()}
+    return weights, np.where(whole, np.rint(bias), 0).astype(np.int64), whole
+
+
 def _stored(stored: Rounded) -> dict[int, Sparse]:
     """Weights from each source in membrane units."""
     return added_up(
         (p.pre, p.effective().astype(np.int64) * (1 << MEMBRANE_SHIFT)) for p in stored.projections
     )
+
+
+def remainders(
+    population: IntegerPopulation, projections: Sequence[IntegerProjection]
+) -> tuple[IntArray, IntArray]:
+    """Most that a membrane which is to keep nothing brings into a step, and, as a magnitude, least; (neurons,)."""
+    up, down = (
+        (side << MEMBRANE_SHIFT).astype(np.float64) for side in one_sided(projections, population.size)
+    )
+    lowest = extreme_membranes(population.threshold, population.bias, population.decay_v, up, down)[1]
+    most = (population.threshold << MEMBRANE_SHIFT) // DECAY_ONE
+    return most, np.ceil(lowest / DECAY_ONE).astype(np.int64) + 1  # the bias is still to move
 
 
 def _bounds(stored: Rounded, step: IntArray) -> tuple[IntArray, IntArray, BoolArray]:
@@ -56,10 +91,7 @@ def _bounds(stored: Rounded, step: IntArray) -> tuple[IntArray, IntArray, BoolAr
     chip = stored.population
     threshold = chip.threshold << MEMBRANE_SHIFT
     up, down = (side << MEMBRANE_SHIFT for side in one_sided(stored.projections, chip.size))
-    floats = up.astype(np.float64), down.astype(np.float64)
-    lowest = extreme_membranes(chip.threshold, chip.bias, chip.decay_v, *floats)[1]
-    below = np.ceil(lowest / DECAY_ONE).astype(np.int64) + 1  # the bias is still to move
-    above = threshold // DECAY_ONE
+    above, below = remainders(chip, stored.projections)
     fires = (threshold - chip.bias) // np.maximum(step, 1) + 1
     concerned = (step > 0) & ((fires - 1) * step <= up) & (-down <= fires * step)
     return threshold - fires * step + below, threshold - (fires - 1) * step - above, concerned
@@ -97,34 +129,31 @@ def ties_moved(layer: FloatLayer, stored: Rounded) -> int:
     chip = stored.population
     if population.alpha or population.beta not in (0, 1):
         return 0
-    floats = added_up((p.pre, p.weight * WHOLE) for p in layer.projections)
-    if not all(np.array_equal(weight.data, np.rint(weight.data)) for weight in floats.values()):
-        return 0
-    if max(np.abs(weight.data).max(initial=0) for weight in floats.values()) >= 2**62:
-        return 0
+    floats, bias, whole = _whole(layer)
     step = _steps(floats)
     weights = _stored(stored)
     chip_step = _steps(weights)
+    if population.beta:  # a bias adds up as a weight does
+        step = np.gcd(step, bias)
+        chip_step = np.gcd(chip_step, chip.bias)
     most = np.max([abs(weight).max(axis=1).toarray().ravel() for weight in floats.values()], axis=0)
-    due, rest = np.divmod((population.theta - population.bias) * WHOLE, np.maximum(step, 1))
-    tied = (step > 0) & (rest == 0) & (due > 0) & (most <= COARSE * step)
-    if population.beta:
-        tied &= population.bias == 0
-    else:
+    needed = population.theta * WHOLE - (0 if population.beta else bias)
+    due = np.rint(needed / np.maximum(step, 1))
+    tied = whole & (step > 0) & (np.abs(due * step - needed) <= CLOSE * population.theta * WHOLE)
+    tied &= (due > 0) & (most <= COARSE * step)
+    if not population.beta:
         reach = np.sum([weight.maximum(0).sum(axis=1) for weight in floats.values()], axis=0)
         tied &= due * step <= reach
     same = _alike(floats, weights, np.maximum(step, 1), chip_step) & (chip_step > 0)
-    same &= ((chip.threshold << MEMBRANE_SHIFT) - chip.bias) // np.maximum(chip_step, 1) == due
-    same &= _keeps_apart(population.beta, chip, stored, chip_step)
+    units = chip.threshold << MEMBRANE_SHIFT
+    if population.beta:
+        same &= chip.bias * step == bias * chip_step
+    else:
+        units = units - chip.bias
+        low, high, concerned = _bounds(stored, chip_step)
+        same &= ~concerned | ((low <= chip.bias) & (chip.bias <= high))
+    same &= units // np.maximum(chip_step, 1) == due
     return int(np.count_nonzero(tied & ~same))
-
-
-def _keeps_apart(beta: float, chip: IntegerPopulation, stored: Rounded, step: IntArray) -> BoolArray:
-    """Which neurons decide by their sums alone, whatever the rest that the membrane keeps."""
-    if beta:
-        return np.asarray(chip.bias == 0)
-    low, high, concerned = _bounds(stored, step)
-    return ~concerned | ((low <= chip.bias) & (chip.bias <= high))
 
 
 def _alike(
