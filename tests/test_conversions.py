@@ -65,7 +65,8 @@ def test_calibration_on_other_bins_is_said(folder, tmp_path):
 
 def test_steps_that_a_file_states_are_not_overruled(folder, tmp_path):
     exported = folder / "own.nir"
-    assert read_nir(exported).read_as == {"dt": 0.05, "convention": "euler"}  # those it was read in
+    read_as = read_nir(exported).read_as
+    assert (read_as["dt"], read_as["convention"]) == (0.05, "euler")  # those it was read in
     for option, value in (("--dt", "0.02"), ("--convention", "exponential")):
         words = refusal("compile", exported, option, value, "-o", tmp_path / "x.loom")
         assert words.startswith(f"{option} {value}: the file states")
@@ -73,6 +74,18 @@ def test_steps_that_a_file_states_are_not_overruled(folder, tmp_path):
     assert (
         run("compile", exported, "--dt", "0.05", "--convention", "euler", "-o", tmp_path / "x.loom")[0] == 0
     )
+
+
+@pytest.mark.parametrize("words", [("explain",), ("stress", "--limit", "2")])
+@pytest.mark.parametrize(("made", "read"), [((), "first"), (("--polarities-first",), "last")])
+def test_a_network_in_another_order_of_polarities_is_refused(folder, tmp_path, made, read, words):
+    net = tmp_path / "net.loom"
+    assert run("compile", folder / "net.nir", "--dt", "0.05", *made, "-o", net)[0] == 0
+    command, *more = words
+    given = (net, "--checkpoint", folder / "net.nir", "--data", folder / "data", *more)
+    other = "first" if made else "last"
+    assert refusal(command, *given, f"--polarities-{read}").endswith(f"give --polarities-{other}")
+    assert run(command, *given, f"--polarities-{other}")[0] in (0, 1)
 
 
 def test_a_start_at_the_reset_is_said():

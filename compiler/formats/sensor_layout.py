@@ -68,6 +68,13 @@ def sensor_layout(
     return _layout(grid, f"[{', '.join(axes)}]{rows}")
 
 
+def order_of(sensor: Input, positions: IntArray) -> dict[str, bool]:
+    """Whether polarities are the first axis of what `positions` were read from; nothing where no order is."""
+    if sensor.taxels < 2 or sensor.polarities < 2:
+        return {}
+    return {"polarities_first": bool(positions[1] != 1)}
+
+
 def _polarity_axis(sizes: list[int], shown: str, polarities: int | None, first: bool | None) -> int:
     """Which axis, the outer or the inner one, are the polarities."""
     inner = len(sizes) - 1

@@ -24,6 +24,13 @@ from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.requests.choices import NetworkChoice
 
 
+def _option(name: str, value: object) -> str:
+    """As it is typed."""
+    if name == "polarities_first":
+        return "--polarities-first" if value else "--polarities-last"
+    return f"--{name} {value}"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoadedNetwork:
     """A float network and where it is from."""
@@ -58,7 +65,7 @@ class LoadedNetwork:
             )
         for name, value in self.origin(run).items():
             if made.get(name, value) != value:
-                why = f"compiled for {name} {made[name]}, this is {value}; give --{name} {made[name]}"
+                why = f"compiled for {name} {made[name]}, this is {value}; give {_option(name, made[name])}"
                 if name == "graph":
                     raise ModelError(f"the netlist was {why}")
                 return why

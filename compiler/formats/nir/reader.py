@@ -34,7 +34,7 @@ from spikeloom.compiler.formats.nir.file import (
     only,
 )
 from spikeloom.compiler.formats.nir.file import in_order as nodes_in_order
-from spikeloom.compiler.formats.sensor_layout import sensor_layout
+from spikeloom.compiler.formats.sensor_layout import order_of, sensor_layout
 from spikeloom.compiler.ir import INPUT, Form, Input, Network, Sparse
 from spikeloom.compiler.targets.loihi1.registers import (
     THRESHOLD_MANTISSA_MAX,
@@ -130,7 +130,7 @@ def network_of(
         network=replace(network, forms=_forms(graph, spiking, network)),
         facts=tuple(facts),
         sha256=graph.sha256,
-        read_as=asdict(steps),
+        read_as=asdict(steps) | order_of(sensor, positions),
         training=training if isinstance(training, dict) else None,
     )
 

@@ -22,7 +22,7 @@ from spikeloom.compiler.formats.onnx.atoms import INPUT_ATOM, Table, as_affine, 
 from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, read_graph
 from spikeloom.compiler.formats.onnx.lif import Neurons, Unrolled, group, is_output, neurons_of, readout
 from spikeloom.compiler.formats.onnx.operators import run
-from spikeloom.compiler.formats.sensor_layout import sensor_layout
+from spikeloom.compiler.formats.sensor_layout import order_of, sensor_layout
 from spikeloom.compiler.ir import INPUT, Network
 
 
@@ -82,7 +82,8 @@ def _network(file: Graph, polarities: int | None, polarities_first: bool | None)
     network = assemble(layers, sensor, voters, label, len(outputs[counted].bias))
     facts += _facts(file, table, groups, outputs, names, words)
     facts.append(f"classes: the spikes of {names[voters]} in output {printable(counted)}")
-    return ReadNetwork(network=network, facts=tuple(facts), sha256=file.sha256)
+    read_as = order_of(sensor, positions)
+    return ReadNetwork(network=network, facts=tuple(facts), sha256=file.sha256, read_as=read_as)
 
 
 def _fixed(declared: Declared, facts: list[str]) -> tuple[int, ...]:

@@ -123,6 +123,7 @@ class ComparedProvenance(Provenance):
     checkpoint_sha256: str
     dt: float | None = field(default=None, metadata=OPTIONAL)
     convention: str | None = field(default=None, metadata=OPTIONAL)
+    polarities_first: bool | None = field(default=None, metadata=OPTIONAL)
     graph: str | None
 
 
