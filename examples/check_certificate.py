@@ -36,7 +36,6 @@ LIMIT = 2**23 - 1  # of currents and membranes
 FAR = 2**40
 APART = [1, 5, 7]  # steps between groups that rule 3 tells apart
 REACH = 12  # steps to the next group that are told apart
-HORIZON = 32  # steps for which bounds are followed; of the rest all votes may turn
 
 
 def require(holds, what):
@@ -288,9 +287,10 @@ class Bounds:
         begin, rows = max(t - far + 1, 0), 1 if far == 1 else 1 + len(source)
         state = chip.unknown(begin, self.least) if begin else self.states[t]
         table, lost = np.zeros((rows, reach, chip.classes), int), np.zeros((rows, chip.classes), int)
+        left = np.arange(rows)  # that are not over yet
         for s in range(begin or t, len(self.counts)):
             now = self.events[None, :, s] if s < self.events.shape[1] else np.zeros((1, chip.channels), bool)
-            sure, may = (np.repeat(now, 1 if s < t else rows, axis=0) for _ in range(2))
+            sure, may = (np.repeat(now, 1 if s < t else len(left), axis=0) for _ in range(2))
             if s == t:
                 state = [np.repeat(each, rows, axis=0) for each in state]
                 sure[0, source], may[0, source] = False, True
@@ -301,18 +301,16 @@ class Bounds:
             if r > 0:
                 known = self.counts[s]
                 lost = lost + (known[self.decision] - fewest[:, [self.decision]]) + most - known
-                if s + 1 == t + HORIZON:
-                    rest = self.counts[s + 1 :]
-                    voters = np.bincount(chip.label[chip.label >= 0], minlength=chip.classes)
-                    lost += rest[:, self.decision].sum() + (voters - rest).sum(axis=0)
-                table[:, min(r, reach) - 1 :] = np.maximum(
-                    lost[:, None], table[:, -1:] if r >= reach else -FAR
-                )
+                before = table[left, -1:] if r >= reach else -FAR
+                table[left, min(r, reach) - 1 :] = np.maximum(lost[:, None], before)
             known, (low, high) = self.states[s + 1], self.safe[s + 1]
             over = (state[2] >= low) & (state[3] <= high) & (state[4] == known[4]) & (state[5] == known[5])
             over &= (chip.keep_u == 0) | ((state[0] == known[0]) & (state[1] == known[1]))
-            if s >= t and (over.all() or s + 1 == t + HORIZON):
-                break
+            if s >= t:
+                goes_on = ~over.all(axis=1)
+                state, left, lost = [each[goes_on] for each in state], left[goes_on], lost[goes_on]
+                if not len(left):
+                    break
         return table[[0, 0]] if rows == 1 else np.stack([table[1:].max(axis=0), table[0]])
 
     def none_of(self, k, apart):

@@ -13,7 +13,7 @@ from made_files import CLASSES, TAXELS, events, recorded, recordings_folder, spa
 from numpy.testing import assert_array_equal
 from random_crossbars import counter_events, random_counters
 from random_netlists import large_netlist, lively, netlists, recordings, voting
-from random_networks import random_checkpoint, ring
+from random_networks import chain, random_checkpoint, ring
 
 from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.formats.counters import counting_network
@@ -157,6 +157,15 @@ def test_none_of_all_pairs_and_triples_breaks_what_is_proven_of_them():
             assert broken == [False] * len(broken) or bound == 0
             proven.append(bound)
     assert {0, 1, 2} <= set(proven)
+
+
+def test_a_neuron_that_fires_by_itself_does_not_make_all_votes_doubtful():
+    weights = ([[0.3, 0.0], [0.0, 1.0]], [[0.0, 1.0], [0.01, 0.0]])
+    machine = machine_of(compile_network(chain(*weights, biases=[[0.42, 0.0], [0.0, 0.0]])).netlist)
+    one = np.zeros((2, 1, 160), np.uint8)
+    one[1, :, 80:] = 1  # until then it keeps whatever phase an event gives it
+    *_, proven = bounded(machine, one)
+    assert proven == 8
 
 
 @pytest.mark.parametrize("seed", [0, 1, 4, 6])

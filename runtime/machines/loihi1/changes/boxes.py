@@ -27,7 +27,7 @@ from spikeloom.runtime.machines.loihi1.changes.chip import LANES, NEVER, Chip, K
 from spikeloom.runtime.machines.loihi1.changes.kernel import integrate
 from spikeloom.runtime.machines.loihi1.changes.safe import FAR, Safe, safe, unsafe
 
-HORIZON = 32
+HORIZON = 512
 """Steps after a group for which its run is followed; of the rest every vote counts as turned."""
 
 
