@@ -34,8 +34,8 @@ def test_verdicts_and_bounds_are_those_of_all_changes(script):
     draw = np.random.default_rng(5)
     found = []
     by_bounds = set()
-    for _ in range(80):
-        weights = [draw.normal(40, 60, (HIDDEN, PIXELS)), draw.normal(40, 80, (CLASSES, HIDDEN))]
+    for _ in range(120):
+        weights = [draw.normal(25, 30, (HIDDEN, PIXELS)), draw.normal(60, 150, (CLASSES, HIDDEN))]
         network = script.Network(weights, STEPS)
         pixels = draw.integers(0, STEPS, PIXELS)
         decision = int(network.outputs(pixels).argmin())
