@@ -42,6 +42,8 @@ def test_verdicts_and_bounds_are_those_of_all_changes(script):
         least = least_that_alters(script, network, pixels, decision)
         for delta in range(1, MOST + 1):
             assert script.holds(network, pixels, decision, delta) == (delta < least)
+            told = script.verdict(network, pixels, decision, delta)
+            assert told == (delta < least) or (told is None and delta > script.EXACT)
             if least and script.proven(network, pixels, decision, delta):
                 assert delta < least
                 by_bounds.add(delta)
