@@ -44,7 +44,7 @@ FURTHEST = 16
 """Largest delta that bounds are asked for."""
 
 EXACT = 2
-"""Steps in all up to which every change is tried where bounds do not decide; one more takes a thousand times as long."""
+"""Steps in all up to which every change is tried where bounds do not decide; one more takes a thousand times longer."""
 
 PATIENCE = 100
 """Seconds in which their search answered an image, so that it is run here, too, until it took as long in all."""
