@@ -35,7 +35,7 @@ Numbers = NDArray[np.float64]
 V = TypeVar("V")
 
 THRESHOLD = 100.0
-NETWORKS = ((5, 10), (5, 20), (64, 256), (64, 512), (256, 128), (256, 512))
+NETWORKS = ((5, 10), (5, 20), (64, 256), (64, 512), (256, 128))
 """Steps and hidden neurons."""
 
 DELTAS = (1, 2, 3)

@@ -13,6 +13,7 @@ RESULTS = ROOT / "benchmarks" / "results"
 DRAWN = {
     "certified",
     "convolutions",
+    "first-spike",
     "fuzz",
     "growth",
     "interrupts",
