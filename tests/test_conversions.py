@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from commands import refusal, run
 from made_files import CLASSES, TAXELS, recordings_folder
+from zoo import counting
 
-from spikeloom.compiler.counters import Counters
-from spikeloom.compiler.formats.counters import write_counters
 from spikeloom.compiler.formats.nir.reader import read_nir
 from spikeloom.compiler.targets.loihi1.lift import lift
 from spikeloom.compiler.targets.loihi1.netlist import read_netlist
@@ -136,18 +135,7 @@ def test_biases_of_later_currents_come_back(tmp_path, options):
 def test_a_netlist_and_its_own_export_match_whatever_the_names_of_layers(tmp_path):
     data = recordings_folder(tmp_path / "data")
     network, netlist, exported = (tmp_path / f"net.{ending}" for ending in ("pt", "loom", "nir"))
-    counter = np.array([(channel, 0, count) for count in (1, 2, 10) for channel in range(2 * TAXELS)])
-    weight = np.random.default_rng(0).integers(-9, 10, (CLASSES, len(counter)))
-    sizes = {
-        "taxels": TAXELS,
-        "polarities": 2,
-        "classes": CLASSES,
-        "bins": 1,
-        "steps": 10,
-        "parts": 1,
-        "ramp": 8,
-    }
-    write_counters(network, Counters(**sizes, counter=counter, weight=weight, slope=9.0, threshold=150.5))
+    counting(tmp_path, counts=(1, 2, 10), parts=1)
     assert run("compile", network, "-o", netlist)[0] == 0
     assert run("export", netlist, "--to", "nir", "-o", exported)[0] == 0
     names = [layer.name for layer in read_netlist(netlist).layers]

@@ -170,11 +170,11 @@ def netx(folder: Path) -> Made:
     return "net.net", TAXELS, "", ""
 
 
-def counting(folder: Path) -> Made:
-    """Counters of two parts of a recording that is shorter than most, and a read-out."""
+def counting(folder: Path, counts: tuple[int, ...] = (1, 2), parts: int = 2) -> Made:
+    """Counters of parts of a recording that is shorter than most, and a read-out."""
     rng = np.random.default_rng(0)
     counter = np.array(
-        [(channel, part, k) for k in (1, 2) for part in (0, 1) for channel in range(2 * TAXELS)]
+        [(channel, part, k) for k in counts for part in range(parts) for channel in range(2 * TAXELS)]
     )
     weight = rng.integers(-9, 10, (CLASSES, len(counter)))
     sizes = {
@@ -183,7 +183,7 @@ def counting(folder: Path) -> Made:
         "classes": CLASSES,
         "bins": 1,
         "steps": 10,
-        "parts": 2,
+        "parts": parts,
         "ramp": 8,
     }
     made = Counters(**sizes, counter=counter, weight=weight, slope=9.0, threshold=150.5)
