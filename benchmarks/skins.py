@@ -13,10 +13,12 @@ those of the kernel of steps, which shares no code with it.
 from __future__ import annotations
 
 import argparse
+import ctypes
 import json
 import multiprocessing
 import platform
 import time
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -54,14 +56,46 @@ def lattice(taxels: int) -> sparse.csr_array:
     return sparse.csr_array(scale @ joined @ scale)
 
 
+def stacked(parts: Iterable[sparse.csr_array]) -> sparse.csr_array:
+    """Rows of matrices below each other, with indices of 32 bits."""
+    return sparse.vstack(
+        [
+            sparse.csr_array((p.data, p.indices.astype(np.int32), p.indptr.astype(np.int32)), p.shape)
+            for p in parts
+        ],
+        format="csr",
+    )
+
+
 def convolution(adjacency: sparse.csr_array, hops: np.ndarray) -> sparse.csr_array:
-    """The synapses of a graph convolution, ``sum_k A^k ⊗ W_k^T``, of which nothing dense is made."""
-    power, total = sparse.eye_array(adjacency.shape[0], format="csr"), 0
-    for hop in hops:
-        total = total + sparse.kron(power, hop, format="csr")
-        power = adjacency @ power
-    total.sort_indices()
-    return sparse.csr_array(total)
+    """The synapses of a graph convolution, ``sum_k A^k ⊗ W_k^T``, made patch by patch."""
+    powers = [sparse.eye_array(adjacency.shape[0], format="csr")]
+    for _ in hops[1:]:
+        powers.append(adjacency @ powers[-1])
+
+    def patch(rows: slice) -> sparse.csr_array:
+        kinds = zip(powers, hops, strict=True)
+        made = sum((sparse.kron(power[rows], hop, format="csr") for power, hop in kinds), start=0)
+        made.sort_indices()
+        return made
+
+    return stacked(patch(slice(first, first + SIDE**2)) for first in range(0, adjacency.shape[0], SIDE**2))
+
+
+def block_diagonal(blocks: Iterable[np.ndarray], columns: int) -> sparse.csr_array:
+    """Dense blocks, each to the right of and below the one before, `columns` wide together."""
+
+    def parts() -> Iterator[sparse.csr_array]:
+        first = 0
+        for block in blocks:
+            rows, width = block.shape
+            place = np.tile(np.arange(first, first + width), rows)
+            yield sparse.csr_array(
+                (block.ravel(), place, np.arange(0, block.size + 1, width)), (rows, columns)
+            )
+            first += width
+
+    return stacked(parts())
 
 
 def skin(taxels: int, seed: int = 0) -> Network:
@@ -69,11 +103,9 @@ def skin(taxels: int, seed: int = 0) -> Network:
     rng = np.random.default_rng(seed)
     conv = convolution(lattice(taxels), rng.normal(0, 0.7, (HOPS, FEATURES, 2)))
     sizes = [min(SIDE * SIDE, taxels - first) * FEATURES for first in range(0, taxels, SIDE * SIDE)]
-    hidden = sparse.block_diag(
-        [rng.normal(0, 3 / size**0.5, (HIDDEN, size)) for size in sizes], format="csr"
-    )
-    votes = sparse.block_diag([rng.normal(0, 0.3, (CLASSES, HIDDEN)) for _ in sizes], format="csr")
-    weights = [conv, sparse.csr_array(hidden), sparse.csr_array(votes)]
+    hidden = block_diagonal((rng.normal(0, 3 / size**0.5, (HIDDEN, size)) for size in sizes), sum(sizes))
+    votes = block_diagonal((rng.normal(0, 0.3, (CLASSES, HIDDEN)) for _ in sizes), HIDDEN * len(sizes))
+    weights = [conv, hidden, votes]
     return Network(
         input=Input(taxels=taxels, polarities=2),
         populations=tuple(
@@ -105,6 +137,7 @@ def measure(taxels: int) -> dict[str, Any]:
     held()
     idle, start = held(), time.perf_counter()
     network = skin(taxels)
+    ctypes.CDLL(None).malloc_trim(0)  # what making it left behind
     made = time.perf_counter()
     built = held()
     compilation = compile_network(network, Options(chips=1 + taxels // 1000))

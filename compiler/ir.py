@@ -23,7 +23,7 @@ INPUT = -1
 Sparse = Any
 """A ``scipy.sparse.csr_array``; scipy ships no types."""
 
-PART = 1 << 19
+PART = 1 << 17
 """Synapses that are worked on at a time where that saves memory."""
 
 
@@ -200,7 +200,7 @@ def recurrent(network: Graph) -> tuple[str, ...]:
 def fan_in(network: Graph, post: int) -> IntArray:
     """Structural synapses into each neuron of a population, planes of one synapse counted once; shape (neurons,)."""
     into = ((p.pre, p.weight) for p in network.projections if p.post == post)
-    ones = added_up((pre, with_data(weight, np.ones(weight.nnz, np.int32))) for pre, weight in into)
+    ones = added_up((pre, with_data(weight, np.ones(weight.nnz, np.bool_))) for pre, weight in into)
     nothing = np.zeros(network.populations[post].size, np.int64)
     return sum((np.diff(weight.indptr) for weight in ones.values()), start=nothing)
 
@@ -216,6 +216,11 @@ def added_up(weights: Iterable[tuple[int, Sparse]]) -> dict[int, Sparse]:
 def with_data(weight: Sparse, data: AnyArray) -> Sparse:
     """A csr_array of other numbers that shares its structure with `weight`: change neither in place."""
     return sparse.csr_array((data, weight.indices, weight.indptr), shape=weight.shape)
+
+
+def entry_parts(weight: Sparse) -> Iterator[slice]:
+    """Synapses of a matrix in turn, ``PART`` at a time."""
+    return (slice(first, first + PART) for first in range(0, weight.nnz, PART))
 
 
 def row_parts(weight: Sparse) -> Iterator[slice]:

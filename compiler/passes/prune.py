@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from spikeloom.compiler.ir import INPUT, Graph, Network, Sparse, row_parts, with_data
+from spikeloom.compiler.ir import INPUT, Graph, Network, Sparse, entry_parts, row_parts, with_data
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 
@@ -135,7 +135,10 @@ def of_source(masks: Sequence[BoolArray], pre: int, size: int) -> BoolArray:
 
 def touched(weight: Sparse, rows: BoolArray, columns: BoolArray) -> BoolArray:
     """Whether each stored synapse is in one of these rows or columns."""
-    return np.asarray(np.repeat(rows, np.diff(weight.indptr)) | columns[weight.indices])
+    inside = np.repeat(rows, np.diff(weight.indptr))
+    for part in entry_parts(weight):
+        inside[part] |= columns[weight.indices[part]]
+    return inside
 
 
 def zeroed(weight: Sparse, rows: BoolArray, columns: BoolArray) -> Sparse:

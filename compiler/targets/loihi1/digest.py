@@ -5,12 +5,13 @@ follow from the checkpoint. Digests show that they are those that the compiler c
 """
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from spikeloom.compiler.ir import added_up
-from spikeloom.compiler.passes.prune import of_source, zeroed
+from spikeloom.compiler.ir import added_up, entry_parts, row_parts
+from spikeloom.compiler.passes.prune import of_source, touched
+from spikeloom.compiler.targets.loihi1.bounds import one_sided_sums
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork
 from spikeloom.compiler.types import AnyArray, BoolArray
 
@@ -26,23 +27,28 @@ def digests(network: IntegerNetwork, gone: Sequence[BoolArray]) -> dict[str, dic
     by_layer = {}
     for post, population in enumerate(network.populations):
         kept = np.flatnonzero(~gone[post])
-        synapses = []
-        into = added_up((p.pre, p.effective()) for p in network.projections if p.post == post)
-        for pre, weight in sorted(into.items()):
-            part = zeroed(weight, gone[post], of_source(gone, pre, weight.shape[1]))
-            if not (part.has_sorted_indices and part.data.all()):
-                part = part.copy()
-                part.eliminate_zeros()
-                part.sort_indices()
-            synapses += [np.array(pre), part.indptr, part.indices, part.data] if part.nnz else []
-        parts = {
+        parts: dict[str, Iterable[AnyArray]] = {
             "neurons": [kept],
             "thresholds": [population.threshold[kept]],
-            "weights": synapses,
+            "weights": _synapses(network, post, gone),
             "biases": [population.bias[kept]],
         }
         by_layer[population.name] = {what: _digest(arrays) for what, arrays in parts.items()}
     return by_layer
+
+
+def _synapses(network: IntegerNetwork, post: int, gone: Sequence[BoolArray]) -> Iterator[AnyArray]:
+    """Source, ends of rows, columns and weights of what a population receives, in parts to save memory."""
+    into = added_up((p.pre, p.effective()) for p in network.projections if p.post == post)
+    for pre, weight in sorted(into.items()):
+        left = ~touched(weight, gone[post], of_source(gone, pre, weight.shape[1])) & (weight.data != 0)
+        if left.any():
+            yield np.array(pre)
+            ends = (weight.indptr[rows.start : rows.stop + 1] for rows in row_parts(weight))
+            counts = [one_sided_sums(left[part[0] : part[-1]].view(np.int8), part)[0] for part in ends]
+            yield np.cumsum(np.append(0, np.concatenate(counts)))
+            for column in (weight.indices, weight.data):
+                yield from (column[part][left[part]] for part in entry_parts(weight))
 
 
 def _digest(arrays: Iterable[AnyArray]) -> str:

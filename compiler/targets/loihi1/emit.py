@@ -28,7 +28,8 @@ def _entries(lists: core_needs.Lists, dense: IntArray, base: int) -> tuple[AnyAr
     rank = np.arange(len(each)) - np.repeat(np.cumsum(lists.nonzero) - lists.nonzero, lists.nonzero)
     place = start[each] + np.where(dense[each], lists.row - lists.first[each], rank)
     within = np.arange(length.sum()) - np.repeat(start, length)
-    target = (np.repeat(lists.first, length) + within + base).astype(np.int32)  # right for dense lists
+    dense_target = np.repeat(lists.first, length) + within + base
+    target = dense_target.astype(core_needs.PLACE)
     target[place] = base + lists.row
     weight = np.zeros(len(target), MANTISSA)
     weight[place] = lists.mantissa
@@ -62,7 +63,9 @@ def _axons(
     """
     per_core = np.zeros(len(cores), np.int64)
     number: dict[core_needs.SynapseFormat, int] = {}
-    columns: list[tuple[AnyArray, ...]] = []
+    columns: list[tuple[IntArray, ...]] = []
+    places = bytearray()  # grows in place, so nothing is held twice
+    weights = bytearray()
     needs = core_needs.Needs(network, target)
     for core, chunks in enumerate(cores):
         base = 0
@@ -83,17 +86,20 @@ def _axons(
                 if projection.pre != INPUT:
                     source = network.input.size + compartment_id[projection.pre][source]
                 per_core[core] += len(source)
-                columns.append((source, formats, *_entries(lists, dense, base)))
+                length, place, weight = _entries(lists, dense, base)
+                columns.append((source, formats, length))
+                places += place.data
+                weights += weight.data
             needs.drop(chunk)  # all of them would be as much as the netlist
             base += chunk.size
-    source, formats, length, place, weight = map(np.concatenate, zip(*columns, strict=True))
+    source, formats, length = map(np.concatenate, zip(*columns, strict=True))
     return {
         "core_axons": read_only(np.cumsum([0, *per_core])),
-        "axon_source": read_only(source),
-        "axon_format": read_only(formats),
+        "axon_source": frozen(source),
+        "axon_format": frozen(formats),
         "axon_synapses": read_only(np.append(0, np.cumsum(length))),
-        "synapse_target": frozen(place),
-        "synapse_weight": frozen(weight),
+        "synapse_target": frozen(np.frombuffer(places, core_needs.PLACE)),
+        "synapse_weight": frozen(np.frombuffer(weights, MANTISSA)),
     }, list(number)
 
 

@@ -82,7 +82,11 @@ class IntegerProjection:
     def effective(self) -> Sparse:
         """Weights in weight units, csr_array of int32; exact, since mantissas are even."""
         units = self.weight.data.astype(np.int32)
-        return with_data(self.weight, units >> 1 if self.exponent < 0 else units << self.exponent)
+        if self.exponent < 0:
+            units >>= 1
+        else:
+            units <<= self.exponent
+        return with_data(self.weight, units)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -99,17 +99,18 @@ def words_of_axons(netlist: Netlist, target: Target) -> IntArray:
     return list_words(np.diff(netlist.axon_synapses), *widths, target)
 
 
-def _stored_on(netlist: Netlist, core: int, target: Target) -> IntArray:
-    """Axons of a core whose lists its memory holds, for themselves and for others."""
+def _stored_words(netlist: Netlist, core: int, target: Target) -> int:
+    """Words of the lists that the memory of a core holds, each once."""
     axons = slice(*netlist.core_axons[core : core + 2].tolist())
     ends = netlist.axon_synapses[axons.start : axons.stop + 1]
     place, weight = (
         column[ends[0] : ends[-1]] for column in (netlist.synapse_target, netlist.synapse_weight)
     )
-    stored: IntArray = axons.start + stored_once(
-        netlist.axon_format[axons], np.diff(ends), place, weight, target
-    )
-    return stored
+    lengths = np.diff(ends)
+    form = netlist.axon_format[axons]
+    stored = stored_once(form, lengths, place, weight, target)
+    widths = netlist.format_weight_bits[form[stored]], netlist.format_index_bits[form[stored]]
+    return int(list_words(lengths[stored], *widths, target).sum())
 
 
 def _distinct_per_core(netlist: Netlist, *columns: IntArray) -> IntArray:
@@ -126,8 +127,6 @@ def measure(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
     source_core = netlist.core_of_compartment()[netlist.axon_source[from_compartment] - netlist.n_inputs]
     entries = np.diff(netlist.axon_synapses)
     index_bits = netlist.format_index_bits[netlist.axon_format]
-    words = words_of_axons(netlist, target)
-    stored = np.concatenate([_stored_on(netlist, core, target) for core in range(cores)])
     dense = (index_bits == 0) & (entries > 0)
     base = np.zeros(cores, np.int64)
     np.maximum.at(base, core_of_axon[dense], netlist.synapse_target[netlist.axon_synapses[:-1][dense]])
@@ -136,7 +135,7 @@ def measure(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
         "core.compartments": np.diff(netlist.core_compartments),
         "core.axons_in": np.diff(netlist.core_axons),
         "core.axons_out": np.bincount(source_core, minlength=cores),
-        "core.synapse_words": np.bincount(core_of_axon[stored], words[stored], cores).astype(np.int64),
+        "core.synapse_words": np.array([_stored_words(netlist, core, target) for core in range(cores)]),
         "core.threshold_slots": _distinct_per_core(netlist, netlist.threshold),
         "core.synapse_formats": np.bincount(formats[0], minlength=cores),
         "core.compartment_configs": _distinct_per_core(netlist, netlist.decay_u, netlist.decay_v),

@@ -269,9 +269,10 @@ def inconsistencies(netlist: Netlist) -> list[str]:
         return found
     if not np.all(np.isfinite(netlist.scale) & (netlist.scale > 0)):
         found.append("scale has values that are not positive numbers")
-    on_core = np.diff(netlist.core_compartments).astype(np.int32)[netlist.core_of_axon()]
-    on_core = np.repeat(on_core, np.diff(netlist.axon_synapses))
-    if is_outside(netlist.synapse_target, 0, 2**31) or np.any(netlist.synapse_target >= on_core):
+    some = np.flatnonzero(np.diff(netlist.axon_synapses))
+    highest = np.maximum.reduceat(netlist.synapse_target, netlist.axon_synapses[some]) if len(some) else some
+    on_core = np.diff(netlist.core_compartments)[netlist.core_of_axon()[some]]
+    if is_outside(netlist.synapse_target, 0, 2**31) or np.any(highest >= on_core):
         found.append("synapse_target points beyond its core")
     if 0 < netlist.blank < netlist.max_depth:
         found.append(f"{netlist.blank} blank steps follow a recording, layers lag up to {netlist.max_depth}")

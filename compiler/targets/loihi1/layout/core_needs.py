@@ -23,6 +23,9 @@ ADDED = ("core.compartments", "core.axons_in", "core.axons_out")
 FEW = 16
 """Neurons of which the input axons are counted first."""
 
+PLACE = np.int16
+"""Type of a place on a core: it has few enough, and places are most of what is held."""
+
 SynapseFormat = tuple[int, int, int]
 """Weight bits, exponent and index bits (0 if dense)."""
 
@@ -77,7 +80,7 @@ def lists_into(network: IntegerNetwork, chunk: Chunk) -> tuple[Lists, ...]:
             part = projection.weight[chunk.first : chunk.last].tocsc()
             part.eliminate_zeros()
             bounds = part.indptr.astype(np.int64)
-            row = part.indices.astype(np.int16)  # a core has few enough, and lists are most of what is held
+            row = part.indices.astype(PLACE)
             source = np.flatnonzero(np.diff(bounds))
             into = Lists(
                 projection=index,

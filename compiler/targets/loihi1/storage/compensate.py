@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from spikeloom.compiler.ir import PART, Projection
+from spikeloom.compiler.ir import Projection
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.targets.loihi1.registers import ONE_STEP_SUM_MAX, reach, step_units
 from spikeloom.compiler.targets.loihi1.storage.scales import (
@@ -38,6 +38,9 @@ DAMPING = 0.03
 
 BLOCK = 64
 """Columns to which the errors of all earlier ones are passed on at once: the same sums, as one matrix product."""
+
+AT_ONCE = 1 << 19
+"""Weights that are rounded at a time; the last bits of their sums depend on it."""
 
 INPUTS = 4096
 """The most active inputs of a neuron, whose errors cancel: no more fit a core. All others are rounded to nearest."""
@@ -73,7 +76,7 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
         together = np.empty((len(shown), len(shown)))
         coincidences(times[inputs[shown]], together)
         share = _share(together)
-        for rows in np.array_split(neurons, -(-len(neurons) * len(inputs) // PART) or 1):
+        for rows in np.array_split(neurons, -(-len(neurons) * len(inputs) // AT_ONCE) or 1):
             places = [_places(p, rows) for p in projections]
             weight = np.concatenate(
                 [p.weight.data[at] for p, at in zip(projections, places, strict=True)], axis=1

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from spikeloom.compiler.ir import Form, Network, Population, Projection
+from spikeloom.compiler.ir import Form, Network, Population, Projection, entry_parts, row_parts
 from spikeloom.compiler.passes.calibrate import Calibration
 from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.loihi1.integers import IntegerPopulation, IntegerProjection, integer_layer
@@ -47,8 +47,12 @@ class FloatLayer:
 
     def peaks(self) -> FloatArray:
         """Magnitude of the largest weight of each neuron; shape (neurons,)."""
-        peaks = [abs(projection.weight).max(axis=1).toarray().ravel() for projection in self.projections]
-        return np.asarray(np.max(peaks, axis=0))
+        peaks = np.zeros(self.population.size)
+        for projection in self.projections:
+            for rows in row_parts(projection.weight):
+                largest = abs(projection.weight[rows]).max(axis=1).toarray().ravel()
+                peaks[rows] = np.maximum(peaks[rows], largest)
+        return peaks
 
 
 def layer_of(network: Network, post: int, calibration: Calibration | None = None) -> FloatLayer:
@@ -194,13 +198,11 @@ def mantissa_scale(layer: Rounded) -> float:
 
 def _unit(projections: Sequence[Projection]) -> float:
     """Largest of 1, 1/2, … 1/64 of which all weights are multiples; 0 without one."""
-    finest = [p.weight.data * 64 for p in projections]
-    if not all(np.array_equal(each, np.rint(each)) for each in finest):
-        return 0.0
-    for unit in (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32):
-        if all(np.all(each % (64 * unit) == 0) for each in finest):
+    parts = [p.weight.data[part] for p in projections for part in entry_parts(p.weight)]
+    for unit in (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32, 1 / 64):
+        if all(np.all(part % unit == 0) for part in parts):
             return unit
-    return 1 / 64
+    return 0.0
 
 
 def candidate(

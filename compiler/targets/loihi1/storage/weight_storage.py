@@ -47,7 +47,7 @@ def store_steps(projection: ir.Projection, steps: IntArray, form: ir.Form) -> tu
     for exponent, mantissa in zip(
         form.exponents, split_planes(steps, form.bits, form.exponents), strict=True
     ):
-        weight = ir.with_data(projection.weight, mantissa.astype(MANTISSA))
+        weight = ir.with_data(projection.weight, mantissa.astype(MANTISSA, copy=False))
         if stored:
             weight = weight.copy()
             weight.eliminate_zeros()
@@ -62,7 +62,7 @@ def nearest_steps(population: ir.Population, projection: ir.Projection, form: ir
     """Weights of a projection in whole steps of the finest plane, each rounded to the nearest; shape (synapses,)."""
     weight = projection.weight
     scale = scales(population, form)
-    steps = np.empty(weight.nnz, np.int32)
+    steps = np.empty(weight.nnz, MANTISSA if len(form.exponents) == 1 else np.int32)
     for rows in ir.row_parts(weight):
         entries = slice(weight.indptr[rows.start], weight.indptr[rows.stop])
         each = np.repeat(scale[rows], np.diff(weight.indptr[rows.start : rows.stop + 1]))
