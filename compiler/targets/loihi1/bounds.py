@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from scipy import sparse
 
 from spikeloom.compiler.ir import INPUT, row_parts
 from spikeloom.compiler.passes.prune import settled
@@ -71,12 +70,13 @@ def one_step_bounds(netlist: Netlist) -> tuple[IntArray, IntArray]:
     No order of arrival and no input can bring a running sum outside ``-negative … positive``: it is reached
     when every positive (negative) synapse is hit at once.
     """
-    synapse = np.arange(netlist.n_synapses)
-    shape = netlist.n_compartments, netlist.n_synapses
-    ordered = sparse.csr_array(
-        (netlist.effective_weight(), (netlist.synapse_compartment(), synapse)), shape=shape
-    )
-    return one_sided_sums(ordered.data, ordered.indptr)
+    positive = np.zeros(netlist.n_compartments, np.int64)
+    negative = np.zeros(netlist.n_compartments, np.int64)
+    for core in range(netlist.n_cores):
+        _, compartment, weight = netlist.synapses_of(core)
+        np.add.at(positive, compartment, np.maximum(weight, 0))
+        np.add.at(negative, compartment, np.maximum(-weight, 0))
+    return positive, negative
 
 
 def largest_current(sums: IntArray | FloatArray, decay_u: IntArray | int) -> FloatArray:

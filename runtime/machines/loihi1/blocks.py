@@ -8,7 +8,7 @@ import numpy.typing as npt
 from spikeloom.compiler.targets.loihi1.bounds import reach
 from spikeloom.compiler.targets.loihi1.netlist import Netlist
 from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, DECAY_BITS, MEMBRANE_MAX, MEMBRANE_SHIFT
-from spikeloom.compiler.types import AnyArray, BoolArray, IntArray
+from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.loihi1.block_kernel import LANES, Blocks
 
 SUM_MAX = 2**15 - 1
@@ -44,19 +44,13 @@ def _refusal(netlist: Netlist) -> str | None:
     if netlist.blank:
         return "no layer has a window"
     depth = np.array([layer.depth for layer in netlist.layers])[netlist.layer]
-    sent = np.append(np.full(netlist.n_inputs, -1), depth)[netlist.axon_source[netlist.axon_of_synapse()]]
-    if np.any(sent != depth[netlist.synapse_compartment()] - 1):  # else no layer has to wait for another
-        return "a layer is recurrent or receives from others than the one before it"
+    sent = np.append(np.full(netlist.n_inputs, -1), depth)
+    for source, compartment, _ in map(netlist.synapses_of, range(netlist.n_cores)):
+        if np.any(sent[source] != depth[compartment] - 1):  # else no layer has to wait for another
+            return "a layer is recurrent or receives from others than the one before it"
     if not _in_range(netlist):
         return "a sum may leave 16 bits, or a membrane or current its register"
     return None
-
-
-def _joined(word: IntArray, position: IntArray, words: int) -> AnyArray:
-    """Words, so many, in which the bits at these positions are set."""
-    joined = np.zeros(words, np.uint64)
-    np.bitwise_or.at(joined, word, _bit(position))
-    return joined
 
 
 def _consecutive(compartment: IntArray) -> IntArray:
@@ -77,27 +71,33 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
     number = np.append(np.arange(netlist.n_inputs), netlist.n_inputs + seats.position)
     width = LANES * max(-(-netlist.n_inputs // LANES), len(seats.layer))
 
-    compartment = netlist.synapse_compartment()
-    block, lane = np.divmod(seats.position[compartment], LANES)
-    local = number[netlist.axon_source[netlist.axon_of_synapse()]]
-    local -= first_source[seats.depth[netlist.layer[compartment]]]
-    pair = block * width + local
-    rows, dense = _rows(netlist, seats, np.unique(pair), width)
+    def places(core: int) -> tuple[IntArray, IntArray, IntArray]:
+        """Row, by its pair, lane and weight of each synapse of a core: of all they would take most memory."""
+        source, compartment, weight = netlist.synapses_of(core)
+        block, lane = np.divmod(seats.position[compartment], LANES)
+        local = number[source] - first_source[seats.depth[netlist.layer[compartment]]]
+        return block * width + local, lane, weight
+
+    cores = range(netlist.n_cores)
+    rows, dense = _rows(netlist, seats, [np.unique(places(core)[0]) for core in cores], width)
     if len(rows) * LANES * 2 > SPARE + BYTES_A_SYNAPSE * netlist.n_synapses:
         return "synapses too scattered for rows of 64"
     row_block, row_source = np.divmod(rows, width)
     net = np.zeros(len(rows) * LANES, np.int16)
-    row = np.searchsorted(rows, pair)
-    # of several synapses of one entry, what leaves 16 bits on the way comes back into them
-    np.add.at(net, row * LANES + lane, netlist.effective_weight().astype(np.int16))
-    reached = _joined(row, lane, len(rows))
+    reached = np.zeros(len(rows), np.uint64)
+    for pair, lane, units in map(places, cores):
+        row = np.searchsorted(rows, pair)
+        # of several synapses of one entry, what leaves 16 bits on the way comes back into them
+        np.add.at(net, row * LANES + lane, units.astype(np.int16))
+        np.bitwise_or.at(reached, row, _bit(lane))
     shift, weight = _narrowed(net, row_block, len(seats.layer))
 
     # links: the rows of a block by words of sources
     words = width // LANES
     word = row_block * words + row_source // LANES
     links, first_row, link = np.unique(word, return_index=True, return_inverse=True)
-    linked = _joined(link, row_source % LANES, len(links))
+    linked = np.zeros(len(links), np.uint64)
+    np.bitwise_or.at(linked, link, _bit(row_source % LANES))
     size = len(seats.layer) * LANES
     bias = np.zeros(size, np.int32)
     threshold = np.full(size, NEVER, np.int32)
@@ -160,8 +160,11 @@ def _seats(netlist: Netlist) -> _Seats:
     )
 
 
-def _rows(netlist: Netlist, seats: _Seats, pairs: IntArray, width: int) -> tuple[IntArray, BoolArray]:
+def _rows(
+    netlist: Netlist, seats: _Seats, of_cores: list[IntArray], width: int
+) -> tuple[IntArray, BoolArray]:
     """Pairs of block and source that get a row, sorted, and whether those of a stage are all that there can be."""
+    pairs = np.unique(np.concatenate(of_cores))
     blocks = np.diff(seats.stage)
     channels = np.append(
         netlist.n_inputs, np.bincount(seats.depth[netlist.layer], minlength=len(blocks))[:-1]
