@@ -81,15 +81,18 @@ def on(address: str, work):
 
 
 def test_commands_give_the_same_bytes(dask, tmp_path, monkeypatch):
-    """A training, and what stresses its network; another version of the code is refused by name."""
+    """A training, and what stresses its network, both say how far they are; another version of the code is refused."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SPIKELOOM_PROGRESS", "json")
     recordings_folder(tmp_path / "data")
     Path("ring.csv").write_text("\n".join(f"{i},{(i + 1) % TAXELS}" for i in range(TAXELS)))
     here = ["--scheduler", dask.address]
     train = ["train", "--data", "data", "--edges", "ring.csv", "--epochs", "1"]
     for folder, more in (("alone", []), ("spread", here)):
         Path(folder).mkdir()
-        commands.as_json(*train, *more, "-o", f"{folder}/net.pt")
+        said = commands.run(*train, *more, "-o", f"{folder}/net.pt")[2]
+        counts = [json.loads(line) for line in said.splitlines() if '"training"' in line]
+        assert [line["done"] for line in counts] == ([0, 1] if more else []), said
         net = f"{folder}/net.pt"
         commands.as_json("compile", net, "-o", f"{folder}/net.loom")
         stress = [
@@ -102,7 +105,11 @@ def test_commands_give_the_same_bytes(dask, tmp_path, monkeypatch):
             "--only",
             "events_lost",
         ]
-        commands.as_json(*stress, "--seeds", "1", *more, "-o", f"{folder}/stress.json")
+        stress += ["--seeds", "1"]
+        said = commands.run(*stress, *more, "-o", f"{folder}/stress.json")[2]
+        points_done = [json.loads(line) for line in said.splitlines() if "total" in line]
+        assert points_done[-1]["done"] == points_done[-1]["total"] > 1, said
+        assert points_done[-1]["left_s"] == 0
         commands.as_json(
             "certify",
             f"{folder}/net.loom",

@@ -1,5 +1,6 @@
 """Lay a netlist out for :mod:`loihi1.block_kernel`, where that is proven to compute what the chip does."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -83,13 +84,7 @@ def lay_out_blocks(netlist: Netlist) -> Blocks | str:
     if len(rows) * LANES * 2 > SPARE + BYTES_A_SYNAPSE * netlist.n_synapses:
         return "synapses too scattered for rows of 64"
     row_block, row_source = np.divmod(rows, width)
-    net = np.zeros(len(rows) * LANES, np.int16)
-    reached = np.zeros(len(rows), np.uint64)
-    for pair, lane, units in map(places, cores):
-        row = np.searchsorted(rows, pair)
-        # of several synapses of one entry, what leaves 16 bits on the way comes back into them
-        np.add.at(net, row * LANES + lane, units.astype(np.int16))
-        np.bitwise_or.at(reached, row, _bit(lane))
+    net, reached = _filled(rows, map(places, cores))
     shift, weight = _narrowed(net, row_block, len(seats.layer))
 
     # links: the rows of a block by words of sources
@@ -176,6 +171,20 @@ def _rows(
         for s in np.flatnonzero(dense)
     ]
     return np.unique(np.concatenate([pairs, *filled])), dense
+
+
+def _filled(
+    rows: IntArray, synapses: Iterable[tuple[IntArray, IntArray, IntArray]]
+) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.uint64]]:
+    """Weights of rows, and the lanes that they reach, from pairs, lanes and weights of synapses."""
+    net = np.zeros(len(rows) * LANES, np.int16)
+    reached = np.zeros(len(rows), np.uint64)
+    for pair, lane, units in synapses:
+        row = np.searchsorted(rows, pair)
+        # of several synapses of one entry, what leaves 16 bits on the way comes back into them
+        np.add.at(net, row * LANES + lane, units.astype(np.int16))
+        np.bitwise_or.at(reached, row, _bit(lane))
+    return net, reached
 
 
 def _narrowed(

@@ -13,7 +13,8 @@ from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import Recordings, data_digest
 from spikeloom.models.training.plan import Plan, seen_by
 from spikeloom.models.training.recipes import RELEASED
-from spikeloom.runtime.report.console import tell
+from spikeloom.runtime.report.console import Progress, tell
+from spikeloom.runtime.studies.cluster import cluster
 from spikeloom.runtime.studies.jobs import only_one, side_by_side
 from spikeloom.runtime.studies.training.results import Finished
 
@@ -145,9 +146,14 @@ def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
             elif resume and not states(job):
                 tell(f"{job.output}: was not begun, trained from the start")
         waiting = [job for job in jobs if job not in results]
+        progress = Progress(len(waiting))
         try:
+            if cluster() is not None:
+                progress(0, "training")
             for place, found in side_by_side(waiting, run_job):
                 results[waiting[place]] = found
+                if cluster() is not None:  # here each has a bar of its own
+                    progress(sum(job in results for job in waiting), "training")
         except UnfinishedError as error:
             raise OptionError(f"{error}; go on with --resume, and with fewer --seeds") from error
         except KeyboardInterrupt as interrupt:
