@@ -35,7 +35,7 @@ from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.machines.loihi1 import engine
 
-TAXELS = (1000, 2000, 5000, 10000, 20000)
+TAXELS = (1000, 2000, 5000, 10000, 20000, 50000, 100000)
 SIDE, FEATURES, HIDDEN, CLASSES, HOPS = 16, 16, 64, 10, 4
 BETA, THETA = 0.2, 0.5
 DENSITY, STEPS, RECORDINGS = 0.02, 50, 4
