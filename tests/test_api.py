@@ -109,6 +109,7 @@ def test_what_does_not_suit_is_refused(data, net):
     refused(TypeError, "wieght_bits", api.compile, "pretrained:grasps", wieght_bits="4")
     assert len(net.run(data.test, limit=2).files) == 2
     refused(DataError, "has 39 taxels, the network has 6", net.run, api.recordings("synthetic").test)
+    refused(OptionError, "split train|recordings of test; omit it", net.run, data.test, split="train")
     refused(OptionError, "data |: ndarray found, allowed: text", net.run, data.test.events)
     refused(
         OptionError,

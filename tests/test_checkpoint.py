@@ -17,7 +17,7 @@ from numpy.testing import assert_array_equal
 from oracles import refused
 
 from spikeloom.compiler.archive import npy_bytes
-from spikeloom.compiler.errors import ModelError
+from spikeloom.compiler.errors import ModelError, OptionError
 from spikeloom.compiler.files import SIZE_LIMIT
 from spikeloom.compiler.formats import torch_file
 from spikeloom.compiler.formats.checkpoint_reader import read_checkpoint
@@ -235,7 +235,9 @@ def test_own_format_round_trip(tmp_path):
     assert_array_equal(read.edges, ring().edges)
     assert (read.taxels, read.classes) == (TAXELS, CLASSES)
     assert read.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
-    assert read_checkpoint(path, beta=0.5).beta == 0.5
+    assert read_checkpoint(path, beta=0.25).beta == 0.25
+    with pytest.raises(OptionError, match=r"--theta 0.5: .* was trained with 0.75; omit --theta"):
+        read_checkpoint(path, theta=0.5)
     assert own() == own() != own(beta=0.3)
 
 

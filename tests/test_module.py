@@ -5,8 +5,10 @@ import pytest
 import torch
 from made_files import recorded, sparse_events
 from made_modules import CLASSES, NETS, TAXELS, AllSteps, OneStep, example_of, mlp, seeded
+from numpy.testing import assert_allclose
 from oracles import refused
 from torch import nn
+from torch.nn.utils import prune, weight_norm
 
 import spikeloom
 from spikeloom.compiler.errors import ModelError, OptionError
@@ -225,3 +227,13 @@ def test_what_a_module_says_itself_is_not_given_beside_it():
 @pytest.mark.parametrize("words", REFUSED)
 def test_refused(words):
     refused(ModelError, words, module_network, seeded(REFUSED[words]), torch.zeros(1, 4))
+
+
+@pytest.mark.filterwarnings("ignore:.*weight_norm:FutureWarning")
+@pytest.mark.parametrize("change", [lambda dense: prune.l1_unstructured(dense, "weight", 0.5), weight_norm])
+def test_weights_that_a_hook_computes_are_as_it_computes_them(change):
+    dense = nn.Linear(6, 4)
+    module = nn.Sequential(dense, LIF(beta=0.5, theta=0.5))
+    change(dense)
+    (projection,) = spikeloom.compile(module, example=torch.zeros(1, 6)).network.projections
+    assert_allclose(projection.weight.toarray(), dense.weight.detach().numpy(), rtol=1e-6)

@@ -104,10 +104,34 @@ def test_recordings_that_chose_the_storage_are_not_verified_on_in_silence(said, 
         assert told in said(words)[1]
     said("compile net.pt --calibrate data -o right.loom")
     assert "chose the network's storage" not in said("run right.loom --data data")[1]
+    told = "warning: test: these 4 are of the 9 recordings that chose the network's storage"
+    assert told in said("run chosen.loom --data data/test --limit 4")[1]
+    assert "chose the network's storage" not in said("run right.loom --data data --limit 4")[1]
+    told = "warning: train: these are the 9 recordings that chose the network's storage"
+    said("lean free.pt --data data --bin 0.05 -o lean.loom")
+    assert told in said("run lean.loom --data data/train")[1]
+    assert read_netlist(place / "lean.loom").provenance["bin_s"] == BIN
     said("compile counters.pt --calibrate data -o own.loom")
     provenance = read_netlist(place / "own.loom").provenance
     assert "train_sha256" in provenance
     assert "calibrated_sha256" not in provenance
+
+
+def test_a_part_of_what_trained_the_network_is_not_reported_in_silence(said):
+    few = "--features 2 --hidden 4 --epochs 1 --data data --bin 0.05 --taxels 6"
+    said(f"train --system mlp {few} --window 50% -o half.pt")
+    said("compile half.pt -o half.loom")
+    for part in ("", " --window 100%", " --window 20%", " --limit 9"):
+        told = "warning: train: these are the 9 recordings that trained the network"
+        assert told in said(f"run half.loom --data data/train{part}")[1]
+    told = "warning: train: these 2 are of the 9 recordings that trained the network"
+    assert told in said("run half.loom --data data/train --limit 2")[1]
+
+
+def test_counters_that_fewer_bits_would_silence_are_said(said):
+    told = "of counters and sums round to zero, which decides otherwise"
+    assert told in said("compile counters.pt --weight-bits 4 -o out.loom")[1]
+    assert told not in said("compile counters.pt --weight-bits 8 -o out.loom")[1]
 
 
 # -- classes, times and conditions -------------------------------------------------------------------------------------
@@ -187,6 +211,11 @@ def test_a_polarity_that_nothing_has_is_said(said, place):
     write(place / "rising" / "test", seed=2, both=False)
     assert "rising: no event of polarity 0 in 9 recordings" in said("run net.loom --data rising")[1]
     assert "no event of polarity" not in said("run net.loom --data data")[1]
+    rng = np.random.default_rng(0)
+    (place / "flat").mkdir(exist_ok=True)
+    for index in range(9):  # one polarity, which counts as rising
+        np.savez(place / "flat" / f"a_{index}_label_0.npz", events=rng.random((30, TAXELS)) < 0.3, bin_s=BIN)
+    assert "flat: no event of polarity 0 in 9 recordings" in said("run net.loom --data flat")[1]
 
 
 def test_conditions_of_some_recordings_are_said(said, place):
@@ -220,6 +249,16 @@ def test_a_network_that_is_joined_to_itself_is_said(said):
     assert told not in said("join net.pt other.pt -o two.pt")[1]
 
 
+def test_watch_says_of_widths_what_run_says(said, place):
+    said("export free.loom --to nir --dt 0.001 -o fine.nir")
+    said("compile fine.nir -o fine.loom")
+    file = next((place / "data" / "test").iterdir()).relative_to(place)
+    told = "bins of 0.05 s, the network was read in steps of 0.001 s; are these its steps?"
+    assert told in said(f"run fine.loom --data {file} --bin 0.05")[1]
+    assert told in said(f"watch fine.loom --input {file} --bin 0.05")[1]
+    assert "read in steps" not in said(f"watch net.loom --input {file}")[1]
+
+
 # -- options and words -------------------------------------------------------------------------------------------------
 def test_counters_end_a_grasp_early_without_being_told_its_length(said, place):
     file = next((place / "data" / "test").iterdir()).relative_to(place)
@@ -232,6 +271,10 @@ def test_no_polarities_are_refused(refused, said):
     said("export free.loom --to nir -o flat.nir")
     told = "--polarities 0: allowed are numbers from 1"
     assert refused("compile flat.nir --polarities 0 -o out.loom") == told
+    for option in ("--polarities 1", "--polarities-first"):
+        told = f"{option}: the file states 2 polarities, those of a taxel in a row; omit it"
+        assert refused(f"compile flat.nir {option} -o out.loom") == told
+    said("compile flat.nir --polarities 2 --polarities-last -o out.loom")
 
 
 def test_a_file_of_integers_is_to_be_compiled_first(refused, place):

@@ -50,12 +50,12 @@ def read_checkpoint(
 
 def _require_fit(where: str, found: Checkpoint, beta: float | None, theta: float | None) -> None:
     """Refuse what contradicts the file."""
-    for name, value, held in (("beta", beta, found.beta), ("theta", theta, found.theta)):
-        if found.forms is not None and value not in (None, held):
-            raise OptionError(f"--{name} {value:g}: {where} was fine-tuned with {held:g}; omit --{name}")
     if beta is not None and found.dynamics.betas:
         decays = ", ".join(f"{each:g}" for each in found.dynamics.betas)
         raise OptionError(f"--beta {beta:g}: {where} has a decay for each layer, {decays}; omit --beta")
+    for name, value, held in (("beta", beta, found.beta), ("theta", theta, found.theta)):
+        if name not in found.assumed and value not in (None, held):
+            raise OptionError(f"--{name} {value:g}: {where} was trained with {held:g}; omit --{name}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -37,7 +37,13 @@ class _Stages:
 
     def __init__(self, net: nn.Module, example: Tensor) -> None:
         reset(net)
-        self.net = copy.deepcopy(net).double().eval().requires_grad_(False)
+        computed = {
+            id(value): value.detach()
+            for part in net.modules()
+            for value in vars(part).values()
+            if isinstance(value, Tensor) and not value.is_leaf  # as pruning leaves, which no copy takes
+        }
+        self.net = copy.deepcopy(net, computed).double().eval().requires_grad_(False)
         names = {id(module): name for name, module in self.net.named_modules() if isinstance(module, LIF)}
         self.order: list[LIF] = []
         self.currents: list[Tensor] = []

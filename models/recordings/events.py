@@ -424,7 +424,7 @@ def _from_events(
             raise DataError(
                 f"{where}: an event at {last:g} s, its table says {duration_s:g} s; fix one of them"
             )
-    return Single(where, grid.shape, stream.label, counts, steps, bin_s, sent=True), grid
+    return Single(where, grid.shape, stream.label, counts, steps, bin_s), grid
 
 
 def _steps(duration_s: float, bin_s: float, where: str) -> int:

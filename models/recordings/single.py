@@ -30,7 +30,6 @@ class Single:
     steps: int  # Its length; 0 where it has no events, and nothing says how long it is
     bin_s: float | None  # Seconds of a bin, where somebody said so
     assumed: bool = False  # Whether an array does not say it
-    sent: bool = False  # Whether it came as events
 
 
 def unit_notes(read: Sequence[Single]) -> list[str]:
@@ -76,7 +75,7 @@ def event_notes(recordings: Recordings, read: Sequence[Single], taxels: int | No
     if (SILENT * ends < recordings.step_counts).all():
         notes += ["no event after a tenth of each recording: are the lengths right, in seconds?"]
     silent = np.flatnonzero(~channels.any(axis=0))
-    if len(read) >= SEVERAL and all(each.sent for each in read) and len(silent):
+    if len(read) >= SEVERAL and len(silent):
         notes += [f"no event of polarity {silent[0]} in {number(len(read), 'recording')}"]
     return [f"{recordings.source}: {note}" for note in notes]
 

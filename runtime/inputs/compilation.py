@@ -12,6 +12,7 @@ from spikeloom.compiler.types import JsonObject
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.checkpoint import given_places
 from spikeloom.runtime.inputs.network import LoadedNetwork
+from spikeloom.runtime.requests.choices import NetworkChoice
 from spikeloom.runtime.requests.main_job import CompileRequest
 
 STORED = ("weight_bits", "planes", "scale_groups", "spike_exact", "keep")
@@ -22,22 +23,9 @@ def provenance(
     request: CompileRequest, asked: LoadedNetwork, *, calibrated: Recordings | None
 ) -> Mapping[str, Any]:
     """What a netlist remembers of its compilation, with scales by the recordings `calibrated`, in their own bins."""
-    seen: JsonObject = {}
-    if calibrated is not None:
-        seen = {"data": calibrated.source, "bin_s": calibrated.bin_s, "class_names": calibrated.names}
-    origin = origin_of(asked.training) or origin_of(seen)
-    if calibrated is not None and calibrated.events_sha256 != origin.get("train_sha256"):
-        origin["calibrated_sha256"] = calibrated.events_sha256
-    checkpoint = asked.checkpoint
     cores_for = parse_cores(request.cores_for)
-    places = given_places(request.taxels)
     return {
-        "spikeloom": __version__,
-        "checkpoint_sha256": asked.sha256,
-        **asked.origin(request.run),
-        **origin,
-        **({"positions_mm": places} if places else {}),
-        **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
+        **known_of(request, asked, calibrated),
         **remembered(storage_of(request, asked.network.forms)),
         "spike_exact": request.spike_exact,
         "keep_all": request.keep_all,
@@ -46,6 +34,26 @@ def provenance(
         "calibrated": calibrated is not None,
         **({"cores_for": cores_for} if cores_for else {}),
         **({"chips": request.chips} if request.chips != 1 else {}),
+    }
+
+
+def known_of(request: NetworkChoice, asked: LoadedNetwork, calibrated: Recordings | None) -> JsonObject:
+    """What a netlist remembers of its network, and of recordings that trained or `calibrated` it, in their own bins."""
+    seen: JsonObject = {}
+    if calibrated is not None:
+        seen = {"data": calibrated.source, "bin_s": calibrated.bin_s, "class_names": calibrated.names}
+    origin = origin_of(asked.training) or origin_of(seen)
+    if calibrated is not None and calibrated.events_sha256 != origin.get("train_sha256"):
+        origin["calibrated_sha256"] = calibrated.events_sha256
+    checkpoint = asked.checkpoint
+    places = given_places(request.taxels)
+    return {
+        "spikeloom": __version__,
+        "checkpoint_sha256": asked.sha256,
+        **asked.origin(request.run),
+        **origin,
+        **({"positions_mm": places} if places else {}),
+        **({"towers": checkpoint.towers} if checkpoint is not None and checkpoint.towers > 1 else {}),
     }
 
 

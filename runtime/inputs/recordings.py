@@ -2,7 +2,8 @@
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,9 @@ from spikeloom.models.recordings.single import other_sensor
 from spikeloom.runtime.report.console import progress, tell
 from spikeloom.runtime.requests.choices import SplitChoice
 
+TEST = "test"
+"""Split that is read unless another is asked for."""
+
 FEW_STEPS = 10
 """A recording of fewer was hardly meant."""
 
@@ -45,14 +49,15 @@ def recordings(
     labels_for: str | None = None,
     trained: Mapping[str, Any] | None = None,
     groups: str | None = None,
+    window: int | None = None,
 ) -> Recordings:
     """Read recordings of any form, or make the package's own synthetic ones; hold both against the network.
 
     Counts of disorder in event files go to stderr. `bins` of them make a step of the network. `labels_for`
     names what needs the label of every recording. `trained` is what is known of the recordings that the
     network was trained on, see :func:`origin_of`: events come in its bins, others are refused, and what
-    looks like other recordings is warned of; of each comes the part that trained it. `groups` are
-    names of conditions, see :mod:`models.recordings.conditions`.
+    looks like other recordings is warned of; of each comes the part that trained it, or the first `window`
+    per cent. `groups` are names of conditions, see :mod:`models.recordings.conditions`.
 
     Raises DataError or OptionError if they cannot be used, or do not suit the network.
     """
@@ -80,9 +85,9 @@ def recordings(
                 warn_of_missing(data, range(classes))
         elif labels_for is not None:
             (data,) = without_gaps(data)
-    data = first_part(data, trained.get("window", WHOLE))
-    _warn_of_training(data, trained)
-    _warn_of_steps(data, trained)
+    _warn_of_training(data, trained, lambda: _unlimited(path, data, limit, bin_s, trained, taxels))
+    data = first_part(data, trained.get("window", WHOLE) if window is None else window)
+    warn_of_steps(data.source, data.seconds, trained)
     warn_of_few(data, bins)
     return events.joined_bins(data, bins)
 
@@ -114,6 +119,26 @@ def _read(
     _require_width(data, bins_s, remedy if data.bin_s is None else "give the events that they were made of")
     _require_sensor(data, split, taxels)
     show_counts(data.source, data.split, data.counts)
+    return data
+
+
+def _unlimited(
+    path: str | Recordings,
+    data: Recordings,
+    limit: int | None,
+    bin_s: float | None,
+    trained: Mapping[str, Any],
+    taxels: int | None,
+) -> Recordings:
+    """All recordings of the split that `data` are the first of; `data` where the others cannot be read."""
+    if isinstance(path, Recordings):
+        return path
+    if limit is None or len(data) < limit or path == SYNTHETIC:
+        return data
+    with suppress(DataError):
+        return events.load_data(
+            path, data.split, bin_s=bin_s, default_bin_s=trained.get("bin_s"), taxels=taxels
+        )
     return data
 
 
@@ -170,25 +195,31 @@ def _warn_of_others(data: Recordings, trained: Mapping[str, Any], classes: int, 
         tell(f"warning: {data.source}: {origin}{advice}")
 
 
-def _warn_of_steps(data: Recordings, trained: Mapping[str, Any]) -> None:
+def warn_of_steps(source: str, seconds: float, trained: Mapping[str, Any]) -> None:
     """Say on stderr that bins are not the steps that a network was read in, where no training says which it needs."""
     step = trained.get("step_s")
-    if step is not None and "bin_s" not in trained and not math.isclose(step, data.seconds, rel_tol=1e-6):
+    if step is not None and "bin_s" not in trained and not math.isclose(step, seconds, rel_tol=1e-6):
         tell(
-            f"warning: {data.source}: bins of {data.seconds:g} s, the network was read in steps of {step:g} s; are "
+            f"warning: {source}: bins of {seconds:g} s, the network was read in steps of {step:g} s; are "
             "these its steps?"
         )
 
 
-def _warn_of_training(data: Recordings, trained: Mapping[str, Any]) -> None:
-    """Say on stderr that what stands for new recordings is what trained the network."""
+def _warn_of_training(
+    data: Recordings, trained: Mapping[str, Any], unlimited: Callable[[], Recordings]
+) -> None:
+    """Say on stderr that what stands for new recordings is what trained the network, or the first of it."""
     did = {"train_sha256": "trained the network", "calibrated_sha256": "chose the network's storage"}
-    for name, done in did.items() if data.split != "train" else ():
-        if name in trained and data.events_sha256 == trained[name]:
-            tell(
-                f"warning: {data.source}: these are the {number(len(data), 'recording')} that {done}; what is reached "
-                "on them says nothing of others"
-            )
+    known = {trained[name]: done for name, done in did.items() if name in trained}
+    if data.split == "train" or not known:
+        return
+    every = first_part(unlimited(), trained.get("window", WHOLE))
+    if (done := known.get(every.events_sha256)) is not None:
+        are = "are" if len(every) == len(data) else f"{len(data)} are of"
+        tell(
+            f"warning: {data.source}: these {are} the {number(len(every), 'recording')} that {done}; what is reached "
+            "on them says nothing of others"
+        )
 
 
 def require_splits(path: str | Recordings) -> None:
@@ -266,11 +297,11 @@ def load_recordings(
     In steps of the network if `joined`, as long a part of each as a ``--window`` says, or as the network was
     trained on, as long as the network needs; else in their own bins.
     """
+    if isinstance(source, Recordings) and request.split not in (TEST, source.split):
+        raise OptionError(
+            f"split {request.split}: these are recordings of {source.split}; omit it, or give others"
+        )
     said = getattr(request, "window", None)
-    window = WHOLE if said is None else parse_window(said)
-    trained = origin_of(netlist.provenance) | step_of(netlist.provenance, netlist.bins)
-    if said is not None:
-        trained.pop("window", None)
     progress("reading the recordings")
     data = recordings(
         source,
@@ -280,15 +311,16 @@ def load_recordings(
         taxels=netlist.taxels,
         bin_s=request.bin,
         labels_for=labels_for,
-        trained=trained,
+        trained=origin_of(netlist.provenance) | step_of(netlist.provenance, netlist.bins),
         groups=getattr(request, "groups", None),
+        window=None if said is None else parse_window(said),
     )
-    return in_steps(data, netlist, window) if joined else data
+    return in_steps(data, netlist) if joined else data
 
 
-def in_steps(data: Recordings, netlist: Netlist, window: int = WHOLE) -> Recordings:
-    """Recordings in steps of a network: the first `window` per cent of each, as long as the network needs."""
-    data = events.joined_bins(first_part(data, window), netlist.bins)
+def in_steps(data: Recordings, netlist: Netlist) -> Recordings:
+    """Recordings in steps of a network, as long as it needs."""
+    data = events.joined_bins(data, netlist.bins)
     length = netlist.clocks.length
     steps = origin_of(netlist.provenance).get("steps", length)
     if length is not None and (

@@ -27,7 +27,7 @@ class ExportRequest(Request):
     bin: float | None = option(BIN_HELP, metavar="S")
     split: str | None = option("ranc: split to read (default: test)")
     recording: int | None = option("ranc: which of them (default: 0)", metavar="N")
-    dt: float | None = option("nir: length of a step (default: 0.02 a bin)", metavar="SECONDS")
+    dt: float | None = option("nir: length of a step (default: that of the recordings)", metavar="SECONDS")
     output: str = option("file to write", required=True, metavar="FILE", flags=("-o", "--output"))
 
 

@@ -142,13 +142,19 @@ def _sensor(
     said = {
         name: stages.stated_steps(graph, name) for name in ("polarities", "bins", "length", "clock_steps")
     }
+    stated = said["polarities"]
+    if stated is not None and ((polarities or stated) != stated or first):
+        option = "--polarities-first" if first else f"--polarities {polarities}"
+        raise OptionError(
+            f"{option}: the file states {stated} polarities, those of a taxel in a row; omit it"
+        )
     channels = stages.stated_steps(graph, "clocks") or 0
     if channels and (channels > MOST_CLOCKS or len(shape) > 1 or shape[0] <= channels):
         raise ModelError(f"has {channels} clocks in an input of shape {list(shape)}; {AGAIN}")
     sensed = (shape[0] - channels,) if channels else shape
     sensor, positions, words = sensor_layout(
         sensed,
-        polarities=said["polarities"] if polarities is None else polarities,
+        polarities=stated if polarities is None else polarities,
         polarities_first=first,
     )
     clocks = Clocks(channels=channels, steps=said["clock_steps"] or 1, length=said["length"])

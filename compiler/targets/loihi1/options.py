@@ -38,6 +38,8 @@ class Options:
             )
         if isinstance(self.storage, Exact) and not calibrated:
             raise OptionError("--spike-exact: nothing to be exact on; give --calibrate")
+        if isinstance(self.storage, Exact) and self.share_lists:
+            raise OptionError("--share-lists: --spike-exact rounds each weight for itself; omit one of them")
         if self.chips < 1:
             raise OptionError(f"--chips {self.chips}: not a number of chips; give 1 or more")
 

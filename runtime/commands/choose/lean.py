@@ -4,18 +4,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from spikeloom.compiler import __version__
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.storage import Fixed, Given
 from spikeloom.compiler.targets.compartments import write_netlist
 from spikeloom.compiler.targets.netlist_file import origin_of
-from spikeloom.models.recordings.events import of_length
+from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.checkpoint import load_graph
-from spikeloom.runtime.inputs.compilation import remembered
+from spikeloom.runtime.inputs.compilation import known_of, remembered
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
-from spikeloom.runtime.inputs.recordings import recordings, require_splits, warn_of_shared
+from spikeloom.runtime.inputs.recordings import recordings, require_splits, step_of, warn_of_shared
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Outcome
@@ -54,21 +53,22 @@ def run(request: LeanRequest) -> Outcome:
     taken = loaded.network.input
     shared: dict[str, Any] = {
         "bin_s": request.bin,
-        "bins": taken.bins,
         "taxels": taken.taxels,
         "labels_for": "lean",
     }
-    shared |= {"classes": loaded.network.classes, "trained": origin_of(loaded.training)}
-    splits = (("train", None), (request.split, request.limit))
-    each = (recordings(request.data, split, limit=limit, **shared) for split, limit in splits)
-    training, test = (of_length(data, taken.clocks.length) for data in each)
+    trained = origin_of(loaded.training) | step_of(loaded.read_as, taken.bins)
+    shared |= {"classes": loaded.network.classes, "trained": trained}
+    known = recordings(request.data, "train", **shared)
+    reported = recordings(request.data, request.split, limit=request.limit, bins=taken.bins, **shared)
+    training = of_length(joined_bins(known, taken.bins), taken.clocks.length)
+    test = of_length(reported, taken.clocks.length)
     warn_of_shared(training, test)
     result, netlist, spared = study(loaded, training, test, request.differ, request.output)
     if request.output is not None:
         lean = {"differ": result.differ} | encode(result.rows[result.taken].removed)
-        made = {"spikeloom": __version__, "checkpoint_sha256": loaded.sha256, **loaded.origin(request.run)}
         forms = loaded.network.forms
-        made |= {**origin_of(loaded.training), **remembered(Fixed() if forms is None else Given(forms))}
+        made = known_of(request, loaded, known)
+        made |= remembered(Fixed() if forms is None else Given(forms))
         made |= {
             "keep_all": False,
             "prune_unused": True,

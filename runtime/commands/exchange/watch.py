@@ -96,12 +96,16 @@ def _bins(request: WatchRequest, netlist: Netlist) -> int | None:
 def _step_seconds(request: WatchRequest, netlist: Netlist) -> Decimal:
     """Length of a step, which may join several bins of the recordings."""
     from spikeloom.models.recordings.evtouch import BIN_S
+    from spikeloom.runtime.inputs.recordings import step_of, warn_of_steps
 
     bin_s = None if request.bin is None else _duration(request.bin)
-    trained = origin_of(netlist.provenance).get("bin_s")
+    origin = origin_of(netlist.provenance)
+    trained = origin.get("bin_s")
     if trained is not None and bin_s not in (None, Decimal(str(trained))):
         raise OptionError(f"--bin {bin_s:g}: the network was trained on bins of {trained:g} s; omit --bin")
-    return netlist.bins * (bin_s or Decimal(str(trained or BIN_S)))
+    bin_s = bin_s or Decimal(str(trained or BIN_S))
+    warn_of_steps(request.netlist, float(bin_s), origin | step_of(netlist.provenance, netlist.bins))
+    return netlist.bins * bin_s
 
 
 def _ending(

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from spikeloom.compiler.errors import OptionError
-from spikeloom.models.recordings.evtouch import WHOLE, Recordings, first_part, parse_window
+from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import BITS
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
@@ -81,13 +81,10 @@ def _against_processor(request: EstimateRequest, machine: Machine, ran: Run, pri
         raise OptionError(
             "against_processor: needs the training split beside these; give the place of the recordings"
         )
-    window = WHOLE if request.window is None else parse_window(request.window)
     training, test = (
         load_recordings(request.data, each, machine.netlist, labels_for="--against-processor", joined=False)
         for each in (replace(request, split="train", limit=None), request)
     )
     right = ran.decisions == test.labels
     bits = min(machine.weight_bits, BITS[-1])
-    return processor.against_processor(
-        first_part(training, window), first_part(test, window), bits, test.seconds, priced, right
-    )
+    return processor.against_processor(training, test, bits, test.seconds, priced, right)

@@ -17,17 +17,18 @@ from spikeloom.compiler.targets.loihi1.options import Options
 from spikeloom.compiler.targets.loihi1.passes import Compilation, compile_network
 from spikeloom.compiler.targets.netlist_file import origin_of
 from spikeloom.compiler.types import BoolArray, EventArray
+from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.runtime.inputs.compilation import parse_cores, provenance, storage_of
-from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
+from spikeloom.runtime.inputs.network import COUNTING, LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import recordings, step_of
 from spikeloom.runtime.inputs.repeat import LAYOUT, NETWORK, ROUNDING, command, refuse, typed
 from spikeloom.runtime.machines.backend import Lowered
 from spikeloom.runtime.machines.base import Model
 from spikeloom.runtime.machines.loihi1 import compiled, description
 from spikeloom.runtime.machines.loihi1.description import NetlistFacts
-from spikeloom.runtime.report.console import progress
+from spikeloom.runtime.report.console import progress, tell
 from spikeloom.runtime.report.encode import HIDDEN, INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.report.shown import Shown
@@ -57,6 +58,7 @@ def lower(request: CompileRequest, after: Callable[[str, Any], object]) -> Lower
         provenance=provenance(request, loaded, calibrated=seen),
     )
     done = compile_network(loaded.network, options, after=after)
+    _warn_of_lost(done, loaded, str(path))
     helps = _finetune(request, checkpoint=loaded.checkpoint is not None)
     return Lowered(
         netlist=done.netlist,
@@ -64,6 +66,16 @@ def lower(request: CompileRequest, after: Callable[[str, Any], object]) -> Lower
         write=lambda output: write_netlist(done.netlist, output),
         report=lambda sha256: compiled.outcome(done, sha256, loaded.facts, helps),
     )
+
+
+def _warn_of_lost(done: Compilation, loaded: LoadedNetwork, path: str) -> None:
+    """Say on stderr that whole weights of a counting network, which decide exactly, round to zero."""
+    lost = sum(choice.zeroed for choice in done.choices)
+    if lost and loaded.format == COUNTING.name:
+        tell(
+            f"warning: {path}: {number(lost, 'weight')} of counters and sums round to zero, which decides otherwise; "
+            "omit --weight-bits, or train with it"
+        )
 
 
 def _model(done: Compilation) -> Model:
