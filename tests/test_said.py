@@ -249,6 +249,23 @@ def test_a_network_that_is_joined_to_itself_is_said(said):
     assert told not in said("join net.pt other.pt -o two.pt")[1]
 
 
+def test_a_folder_of_one_split_has_the_bins_that_are_said_beside_it(said):
+    said("data convert data --bin 0.05 -o binned")
+    for path in ("binned", "binned/test"):
+        assert "1.5 s in bins of 0.05 s" in said(f"data describe {path}")[0]
+    said("run net.loom --data binned/test")
+
+
+def test_recordings_that_last_longer_than_the_clocks_are_said(said, place):
+    write(place / "longer" / "test", seed=2, steps=40)
+    few = "--features 2 --hidden 4 --epochs 1 --data data --bin 0.05 --taxels 6"
+    said(f"train --system mlp {few} --clocks 4 -o clocks.pt")
+    said("compile clocks.pt -o clocks.loom")
+    told = "warning: longer: up to 40 steps, the network's clocks stop after 32"
+    assert told in said("run clocks.loom --data longer")[1]
+    assert "clocks stop" not in said("run clocks.loom --data data")[1]
+
+
 def test_watch_says_of_widths_what_run_says(said, place):
     said("export free.loom --to nir --dt 0.001 -o fine.nir")
     said("compile fine.nir -o fine.loom")

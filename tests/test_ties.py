@@ -66,6 +66,22 @@ def test_ties_that_a_storage_decides_otherwise_are_said():
     assert "fc1: 1 neuron can get sums of exactly the threshold and, rounded, may decide" in said
 
 
+def test_ties_of_a_first_step_are_counted_where_they_are_moved_whatever_the_membrane_keeps():
+    weight = np.array([[1.0, 2.0, 4.0], [2.0, 4.0, 1.0], [3.0, 3.0, 3.0]])
+    given = events(1)[..., :3]
+    counted = []
+    for beta in (0.0, 0.5, 0.2):
+        network = nets.chain(weight * [[1], [2 / 3], [2 / 3]], beta=beta, theta=2.0)
+        done = compile_network(network, Options(storage=Fixed((Packing(),))))
+        fired = run_integer(lift(done.netlist), given).spikes[0]
+        moved = np.any(fired != (given @ weight.T > [2, 3, 3]), axis=(0, 1))
+        counted.append((np.count_nonzero(moved), done.choices[0].ties))
+    assert all(moved <= ties for moved, ties in counted)
+    assert counted[1][1] > 0
+    real = nets.chain(np.random.default_rng(0).normal(size=(4, 3)), beta=0.5, theta=2.0)
+    assert not compile_network(real).choices[0].ties
+
+
 def test_what_makes_up_for_the_memory_comes_back_from_an_export(tmp_path):
     integer = lift(compile_network(nets.chain([[1.0, 1.0, 1.0, 1.0]], beta=0.0, theta=2.0)).netlist)
     assert integer.populations[0].bias < 0

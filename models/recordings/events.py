@@ -349,15 +349,19 @@ def _data_set(
             for name, member in members.items()
             if not is_table(name) and PurePosixPath(name).name != evtouch.WIDTH
         }
+        above: evtouch.Members = {}
         splits = evtouch.splits_of(source, plain, {*SPLITS, split})
         if not splits and (path.is_dir() or path.suffix.lower() == ".zip"):  # networks are zips, too
             splits = _flat(plain)
+            width = path.absolute().parent / evtouch.WIDTH
+            if path.is_dir() and width.is_file():  # the folder is a split, then, and it stands beside all
+                above = {width.name: partial(width.open, "rb")}
         if not splits:
             raise DataError(
                 f"{source}: no recordings (train/ or test/ with .csv, .npz or sample_N_label_L.npy); "
                 "give the folder or zip that holds train/ and test/"
             )
-        yield members, splits
+        yield {**above, **members}, splits
 
 
 def _flat(members: evtouch.Members) -> dict[str, dict[str, str]]:

@@ -332,6 +332,12 @@ def in_steps(data: Recordings, netlist: Netlist) -> Recordings:
             else f"they may move votes until step {length}, later ones are not used"
         )
         tell(f"warning: {data.source}: {number(late, 'event')} after the network's {steps} steps: {used}")
+    clocks = netlist.clocks.channels * netlist.clocks.steps
+    if clocks and length is None and data.steps > clocks:
+        tell(
+            f"warning: {data.source}: up to {data.steps} steps, the network's clocks stop after {clocks}; are these "
+            "recordings as long as its own?"
+        )
     return events.of_length(data, length)
 
 

@@ -123,33 +123,36 @@ def without_memory(layer: FloatLayer, stored: Rounded) -> Rounded:
 def ties_moved(layer: FloatLayer, stored: Rounded) -> int:
     """How many neurons sums can bring exactly to their threshold that decide these, as stored, otherwise.
 
-    Known of layers that keep nothing, or all, of their membrane, with weights of few values.
+    Known of layers whose weights have few values: of all sums where the membrane keeps nothing, or all, else of those
+    that one step adds to a membrane at rest.
     """
     population = layer.population
     chip = stored.population
-    if population.alpha or population.beta not in (0, 1):
+    if population.alpha:
         return 0
+    lasting = population.beta == 1
     floats, bias, whole = _whole(layer)
     step = _steps(floats)
     weights = _stored(stored)
     chip_step = _steps(weights)
-    if population.beta:  # a bias adds up as a weight does
+    if lasting:  # a bias adds up as a weight does
         step = np.gcd(step, bias)
         chip_step = np.gcd(chip_step, chip.bias)
     most = np.max([abs(weight).max(axis=1).toarray().ravel() for weight in floats.values()], axis=0)
-    needed = population.theta * WHOLE - (0 if population.beta else bias)
+    needed = population.theta * WHOLE - (0 if lasting else bias)
     due = np.rint(needed / np.maximum(step, 1))
     tied = whole & (step > 0) & (np.abs(due * step - needed) <= CLOSE * population.theta * WHOLE)
     tied &= (due > 0) & (most <= COARSE * step)
-    if not population.beta:
+    if not lasting:
         reach = np.sum([weight.maximum(0).sum(axis=1) for weight in floats.values()], axis=0)
         tied &= due * step <= reach
     same = _alike(floats, weights, np.maximum(step, 1), chip_step) & (chip_step > 0)
     units = chip.threshold << MEMBRANE_SHIFT
-    if population.beta:
+    if lasting:
         same &= chip.bias * step == bias * chip_step
     else:
         units = units - chip.bias
+    if not population.beta:
         low, high, concerned = _bounds(stored, chip_step)
         same &= ~concerned | ((low <= chip.bias) & (chip.bias <= high))
     same &= units // np.maximum(chip_step, 1) == due
