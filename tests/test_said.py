@@ -104,7 +104,7 @@ def test_recordings_that_chose_the_storage_are_not_verified_on_in_silence(said, 
         assert told in said(words)[1]
     said("compile net.pt --calibrate data -o right.loom")
     assert "chose the network's storage" not in said("run right.loom --data data")[1]
-    told = "warning: test: these 4 are of the 9 recordings that chose the network's storage"
+    told = "warning: test: these are 4 of the 9 recordings that chose the network's storage"
     assert told in said("run chosen.loom --data data/test --limit 4")[1]
     assert "chose the network's storage" not in said("run right.loom --data data --limit 4")[1]
     told = "warning: train: these are the 9 recordings that chose the network's storage"
@@ -124,7 +124,7 @@ def test_a_part_of_what_trained_the_network_is_not_reported_in_silence(said):
     for part in ("", " --window 100%", " --window 20%", " --limit 9"):
         told = "warning: train: these are the 9 recordings that trained the network"
         assert told in said(f"run half.loom --data data/train{part}")[1]
-    told = "warning: train: these 2 are of the 9 recordings that trained the network"
+    told = "warning: train: these are 2 of the 9 recordings that trained the network"
     assert told in said("run half.loom --data data/train --limit 2")[1]
 
 

@@ -75,7 +75,7 @@ def event_notes(recordings: Recordings, read: Sequence[Single], taxels: int | No
     if (SILENT * ends < recordings.step_counts).all():
         notes += ["no event after a tenth of each recording: are the lengths right, in seconds?"]
     silent = np.flatnonzero(~channels.any(axis=0))
-    if len(read) >= SEVERAL and len(silent):
+    if sum(each.counts.events > 0 for each in read) >= SEVERAL and len(silent):
         notes += [f"no event of polarity {silent[0]} in {number(len(read), 'recording')}"]
     return [f"{recordings.source}: {note}" for note in notes]
 

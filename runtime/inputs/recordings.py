@@ -215,7 +215,7 @@ def _warn_of_training(
         return
     every = first_part(unlimited(), trained.get("window", WHOLE))
     if (done := known.get(every.events_sha256)) is not None:
-        are = "are" if len(every) == len(data) else f"{len(data)} are of"
+        are = "are" if len(every) == len(data) else f"are {len(data)} of"
         tell(
             f"warning: {data.source}: these {are} the {number(len(every), 'recording')} that {done}; what is reached "
             "on them says nothing of others"
