@@ -289,7 +289,7 @@ def test_no_polarities_are_refused(refused, said):
     told = "--polarities 0: allowed are numbers from 1"
     assert refused("compile flat.nir --polarities 0 -o out.loom") == told
     for option in ("--polarities 1", "--polarities-first"):
-        told = f"{option}: the file states 2 polarities, those of a taxel in a row; omit it"
+        told = f"{option}: the file states 2 polarities, a taxel's in a row; omit it"
         assert refused(f"compile flat.nir {option} -o out.loom") == told
     said("compile flat.nir --polarities 2 --polarities-last -o out.loom")
 

@@ -145,18 +145,13 @@ def _sensor(
     stated = said["polarities"]
     if stated is not None and ((polarities or stated) != stated or first):
         option = "--polarities-first" if first else f"--polarities {polarities}"
-        raise OptionError(
-            f"{option}: the file states {stated} polarities, those of a taxel in a row; omit it"
-        )
+        raise OptionError(f"{option}: the file states {stated} polarities, a taxel's in a row; omit it")
     channels = stages.stated_steps(graph, "clocks") or 0
     if channels and (channels > MOST_CLOCKS or len(shape) > 1 or shape[0] <= channels):
         raise ModelError(f"has {channels} clocks in an input of shape {list(shape)}; {AGAIN}")
     sensed = (shape[0] - channels,) if channels else shape
-    sensor, positions, words = sensor_layout(
-        sensed,
-        polarities=stated if polarities is None else polarities,
-        polarities_first=first,
-    )
+    count = stated if polarities is None else polarities
+    sensor, positions, words = sensor_layout(sensed, polarities=count, polarities_first=first)
     clocks = Clocks(channels=channels, steps=said["clock_steps"] or 1, length=said["length"])
     positions = np.append(positions, np.arange(sensor.size, sensor.size + channels))
     words += f", then {channels} clocks of {clocks.steps} steps" if channels else ""

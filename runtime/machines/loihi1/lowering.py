@@ -70,10 +70,10 @@ def lower(request: CompileRequest, after: Callable[[str, Any], object]) -> Lower
 
 def _warn_of_lost(done: Compilation, loaded: LoadedNetwork, path: str) -> None:
     """Say on stderr that whole weights of a counting network, which decide exactly, round to zero."""
-    lost = sum(choice.zeroed for choice in done.choices)
-    if lost and loaded.format == COUNTING.name:
+    zeroed = sum(choice.zeroed for choice in done.choices)
+    if zeroed and loaded.format == COUNTING.name:
         tell(
-            f"warning: {path}: {number(lost, 'weight')} of counters and sums round to zero, which decides otherwise; "
+            f"warning: {path}: {number(zeroed, 'weight')} of counters and sums round to zero, which decides otherwise; "
             "omit --weight-bits, or train with it"
         )
 
