@@ -10,18 +10,7 @@ again from the netlist, whose hash is compared, and the chip's integers, by thes
 and spikes on their way) go on alike, so one of them stands for both, with the most votes of either for each class
 beyond those of the decision.
 
-*k events of counters* (Loihi): see ``check_counts.py``.
-
-*k events* (Loihi). Let events change at the steps t1 < t2 < …; those of one step are a *group*. A vote sees an event
-`lag` steps later at the earliest. So votes before t1 + lag are the known ones, and those from ti + lag to before
-ti+1 + lag depend on no group after i. ``turned`` bounds how many of these can turn, whatever there was until group
-i - 1: interval arithmetic from all registers that any input can bring about, through the known events between the
-groups, the group (its one change, or any), and known events again. Decay, sums, saturation and comparison are
-monotone, and a reset leaves zero or what is below the threshold, so no run leaves its bounds. They are followed until
-every membrane is where known events make every spike the known one for ever (``safe``: an interval, found backwards).
-``none_of`` adds the worst of all steps, distances and sizes of groups that have k events together; the distance to the
-group before decides what is known, that to the next how many votes count. If no class makes up for what it lacks, no
-k events alter the decision.
+*k events* (Loihi): see ``check_groups.py``, and for counters ``check_counts.py``.
 """
 
 import hashlib
@@ -34,8 +23,6 @@ import numpy as np
 
 LIMIT = 2**23 - 1  # of currents and membranes
 FAR = 2**40
-APART = [1, 5, 7]  # steps between groups that rule 3 tells apart
-REACH = 12  # steps to the next group that are told apart
 
 
 def require(holds, what):
@@ -65,13 +52,6 @@ def parts(bounds):
 def decayed(value, keep):
     """``value * keep / 4096`` toward zero."""
     return np.sign(value) * (np.abs(value) * keep >> 12)
-
-
-def largest(most, keep):
-    """Largest value of which at most `most` is kept."""
-    k = np.maximum(keep, 1)
-    found = np.where(most >= 0, ((most + 1) * 4096 - 1) // k, -((-most * 4096 + k - 1) // k))
-    return np.clip(np.where(keep > 0, found, np.where(most >= 0, FAR, -FAR)), -FAR, FAR)
 
 
 class Chip:
@@ -152,6 +132,14 @@ class Loihi(Chip):
         box[2] = np.where(sure, 0, np.where(may, np.minimum(box[2], 0), box[2]))
         box[3] = np.where(sure, 0, np.where(may, self.threshold, box[3]))
         return [*box, sure, may], (self.votes(sure), self.votes(may))
+
+    def lowest(self, steps):
+        """Membranes below which none is within so many steps, whatever the input."""
+        least = np.zeros(self.neurons, np.int64)
+        for _ in range(steps):
+            sunk = decayed(least, self.keep_v) + self.most[0] + np.minimum(self.bias, 0)
+            least = np.maximum(sunk, -LIMIT)
+        return least
 
     def unknown(self, begin, least):
         """Whatever any input can have brought about before a step."""
@@ -248,97 +236,14 @@ def run(chip, events, flips, decision):
     return states, np.array(counts), bool(np.delete(wins, decision).any())
 
 
-def safe(chip, states):
-    """Least and largest membrane before each step from which, the events known, all spikes are the known ones."""
-    ends = [(np.full(chip.neurons, -FAR), np.full(chip.neurons, FAR))]
-    for t in reversed(range(len(states) - 1)):
-        more, fired = states[t + 1][0][0] + chip.bias, states[t + 1][4][0]
-        least = np.where(fired, chip.threshold + 1, ends[-1][0])
-        most = np.where(fired, FAR, np.minimum(chip.threshold, ends[-1][1]))
-        low = np.where(least <= -LIMIT, -FAR, -largest(more - least, chip.keep_v))
-        high = np.where(most >= LIMIT, FAR, largest(most - more, chip.keep_v))
-        inside = (chip.depth <= t) & (t < chip.depth + chip.steps)
-        ends.append((np.where(inside, low, -FAR), np.where(inside, high, FAR)))
-    return ends[::-1]
-
-
-class Bounds:
-    """What groups of changed events can turn in one recording."""
-
-    def __init__(self, chip, events, flips, decision, states, counts):
-        self.chip, self.events, self.flips, self.decision = chip, events, flips, decision
-        self.states, self.counts, self.safe = states, counts, safe(chip, states)
-        self.least = np.zeros(chip.neurons, np.int64)  # no membrane is below that, whatever the input
-        for _ in counts:
-            sunk = decayed(self.least, chip.keep_v) + chip.most[0] + np.minimum(chip.bias, 0)
-            self.least = np.maximum(sunk, -LIMIT)
-        reached, self.lag = np.arange(chip.channels + chip.neurons) < chip.channels, -1
-        while self.lag < len(counts) and not (chip.label[reached[chip.channels :]] >= 0).any():
-            low, high = chip.sums(reached[None] & False, reached[None])
-            reached[chip.channels :] |= (low[0] < 0) | (high[0] > 0)
-            self.lag += 1
-
-    def turned(self, t, far, reach):
-        """Votes that each class gains on the decision until the next group comes 1 … `reach` steps later, or never.
-
-        The group is of step `t`, the one before it at least `far` steps ago. By (one event or more, reach, classes).
-        """
-        chip, source = self.chip, np.flatnonzero(self.flips[:, t])
-        begin, rows = max(t - far + 1, 0), 1 if far == 1 else 1 + len(source)
-        state = chip.unknown(begin, self.least) if begin else self.states[t]
-        table, lost = np.zeros((rows, reach, chip.classes), int), np.zeros((rows, chip.classes), int)
-        left = np.arange(rows)  # that are not over yet
-        for s in range(begin or t, len(self.counts)):
-            now = self.events[None, :, s] if s < self.events.shape[1] else np.zeros((1, chip.channels), bool)
-            sure, may = (np.repeat(now, 1 if s < t else len(left), axis=0) for _ in range(2))
-            if s == t:
-                state = [np.repeat(each, rows, axis=0) for each in state]
-                sure[0, source], may[0, source] = False, True
-                for k in range(1, rows):
-                    sure[k, source[k - 1]] = may[k, source[k - 1]] = not now[0, source[k - 1]]
-            state, (fewest, most) = chip.tick(state, (sure, may), s)
-            r = s + 1 - t - self.lag
-            if r > 0:
-                known = self.counts[s]
-                lost = lost + (known[self.decision] - fewest[:, [self.decision]]) + most - known
-                before = table[left, -1:] if r >= reach else -FAR
-                table[left, min(r, reach) - 1 :] = np.maximum(lost[:, None], before)
-            known, (low, high) = self.states[s + 1], self.safe[s + 1]
-            over = (state[2] >= low) & (state[3] <= high) & (state[4] == known[4]) & (state[5] == known[5])
-            over &= (chip.keep_u == 0) | ((state[0] == known[0]) & (state[1] == known[1]))
-            if s >= t:
-                goes_on = ~over.all(axis=1)
-                state, left, lost = [each[goes_on] for each in state], left[goes_on], lost[goes_on]
-                if not len(left):
-                    break
-        return table[[0, 0]] if rows == 1 else np.stack([table[1:].max(axis=0), table[0]])
-
-    def none_of(self, k, apart):
-        """Whether no `k` events alter the decision, by how far groups are `apart` at least (rising from 1)."""
-        steps, classes = self.flips.shape[1], self.chip.classes
-        reach = REACH
-        # votes lost to groups before one at a step, by its distance to the last of them and events so far
-        enter = np.full((steps + reach, len(apart), k + 1, classes), -FAR)
-        enter[:, -1, 0] = 0
-        worst = np.zeros((k + 1, classes), np.int64)
-        for t in np.flatnonzero(self.flips.any(axis=0)):
-            for level, far in enumerate(apart):
-                for events, lost in enumerate(self.turned(t, far, reach)[: min(k, 2)], 1):
-                    after = enter[t, level, : k + 1 - events, None] + lost
-                    for r in range(1, reach):
-                        to = enter[t + r, sum(each <= r for each in apart) - 1, events:]
-                        np.maximum(to, after[:, r - 1], out=to)
-                    to = enter[t + reach :, -1, events:]
-                    np.maximum(to, after[:, -1], out=to)
-                    np.maximum(worst[events:], after[:, -1], out=worst[events:])
-        votes = self.counts.sum(axis=0)
-        needed = votes[self.decision] - votes + (np.arange(classes) > self.decision)
-        return bool(np.delete(worst.max(axis=0) < needed, self.decision).all())
+def beside(name):
+    """What a file beside this one defines."""
+    return run_path(str(Path(__file__).with_name(name)))
 
 
 def check(chip, events, bins, claim):
     """Hold the claims about one recording against the chip; `bins` (channels, steps) are those set in each step."""
-    decision, k, rule, changes = claim
+    decision, k, rule, changes, apart = claim
     flips = np.zeros(events.shape, np.bool_)
     none, single = flips.copy(), flips.copy()
     flips[: len(bins), : bins.shape[1]] = True
@@ -350,12 +255,16 @@ def check(chip, events, bins, claim):
     require(not alters, "that no single event alters the decision")
     require(rule < 2 or isinstance(chip, Loihi), f"rule {rule}, which is for Loihi")
     if rule == 4:
-        rules = run_path(str(Path(__file__).with_name("check_counts.py")))
-        proven = rules["Counts"](chip, require).none_of(k, events, bins, decision)
-        require(proven, f"that no {k} events alter the decision")
+        counts = beside("check_counts.py")["Counts"](chip, require)
+        require(counts.none_of(k, events, bins, decision), f"that no {k} events alter the decision")
     elif rule > 1:
-        bounds = Bounds(chip, events, flips[:, : bins.shape[1]], decision, states, counts)
-        require(bounds.none_of(k, [1] if rule == 2 else APART), f"that no {k} events alter the decision")
+        far, single, step = apart.T
+        told = (far > 0) & np.isin(single, (0, 1)) & (step >= far * single) & (step < bins.shape[1])
+        require(told.all(), "what is told apart of the past")
+        flips = flips[:, : bins.shape[1]]
+        groups = beside("check_groups.py")["Groups"](chip, events, flips, decision, states, counts)
+        none_alter = groups.none_of(k, apart if rule == 3 else apart[:0])
+        require(none_alter, f"that no {k} events alter the decision")
     if len(changes):
         channel, step = changes.T
         within = np.all((changes >= 0) & (changes < bins.shape))
@@ -378,12 +287,13 @@ def main(netlist, certificate):
 def check_all(netlist, certificate):
     """Check all claims; the first that does not hold ends it."""
     about, arrays = load(certificate)
-    require(about.get("format") == "spikeloom-certificate" and about.get("version") == 1, "the format")
+    require(about.get("format") == "spikeloom-certificate" and about.get("version") == 2, "the format")
     found = hashlib.sha256(Path(netlist).read_bytes()).hexdigest()
     require(found == about["netlist_sha256"], f"a certificate of another netlist, {about['netlist_sha256']}")
     network, cores = load(netlist)
     chip = {"loihi1": Loihi, "truenorth": TrueNorth}[network["target"]](network, cores)
     clocks, bounds, ends = network["clocks"], arrays["step_bounds"], arrays["change_bounds"]
+    pasts = arrays["past_bounds"]
     print(f"{netlist}: as certified; {len(about['files'])} recordings")
     for n, file in enumerate(about["files"]):
         bins = arrays["bins"][:, bounds[n] : bounds[n + 1]]
@@ -394,7 +304,9 @@ def check_all(netlist, certificate):
         ticking = np.arange(steps) // clocks["steps"] == np.arange(clocks["channels"])[:, None]
         events[len(bins) :] = ticking
         claim = [int(arrays[name][n]) for name in ("decision", "unaltered", "rule")]
-        cost = check(chip, events, bins, (*claim, arrays["changes"][ends[n] : ends[n + 1]]))
+        changes = arrays["changes"][ends[n] : ends[n + 1]]
+        apart = arrays["pasts"][pasts[n] : pasts[n + 1]]
+        cost = check(chip, events, bins, (*claim, changes, apart))
         altered = f"; {cost} alter it" if cost else ""
         print(f"{plain(file)}: decides {claim[0]}; no {claim[1]} events alter that{altered}", flush=True)
 

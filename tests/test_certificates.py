@@ -45,7 +45,7 @@ def checked(folder, netlist, members):
     return done.returncode, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("name", ["check_certificate.py", "check_counts.py"])
+@pytest.mark.parametrize("name", ["check_certificate.py", "check_groups.py", "check_counts.py"])
 def test_the_checker_needs_numpy_alone_and_is_short(name):
     text = CHECKER.with_name(name).read_text()
     tree = ast.parse(text)

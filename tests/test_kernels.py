@@ -10,7 +10,7 @@ from zoo import specimen
 from spikeloom.compiler.dynamics import with_clocks
 from spikeloom.compiler.interpret import float_simulation
 from spikeloom.models.networks.layers import spike_linear
-from spikeloom.runtime.machines.changes import single
+from spikeloom.runtime.machines.changes import Past, single
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.changes import kernel
 from spikeloom.runtime.machines.loihi1.changes.chip import chip_of
@@ -57,10 +57,10 @@ def timed(**more):
     timing.detailed(tables, spikes, spikes, events, steps=np.array([sizes["steps"]]))
 
 
-def grouped(*, steps=5, decision=0, reach=1):
+def grouped(*, steps=5, decision=0, step=0, single=False):
     machine = specimen("counters").machine
     channels = np.ones((machine.netlist.n_inputs, 5), np.uint8)
-    machine.groups(channels, steps, decision, np.array([1]), reach)
+    machine.groups(channels, steps, decision, 1).after(Past(1, single), step)
 
 
 OUTSIDE = {
@@ -76,7 +76,8 @@ OUTSIDE = {
     "a chip step that is timed": lambda: timed(steps=1),
     "a step that events are changed in": lambda: grouped(steps=6),
     "a class that is decided": lambda: grouped(decision=99),
-    "a spacing that is out of reach": lambda: grouped(reach=0),
+    "a step of a group": lambda: grouped(step=5),
+    "a step of the group before": lambda: grouped(single=True),
 }
 
 

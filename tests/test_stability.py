@@ -23,14 +23,14 @@ from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.compiler.targets.truenorth.passes import compile_crossbars
 from spikeloom.models.training.counters import Plan, counters_of, fit, run_counters
 from spikeloom.runtime.machines.backends import machine_of
-from spikeloom.runtime.machines.changes import Changes, by_running, joined, single
+from spikeloom.runtime.machines.changes import Changes, Past, by_running, joined, single
 from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.changes.chip import overflows
 from spikeloom.runtime.report.encode import decode
 from spikeloom.runtime.studies.robustness.certify_sections import hanging_on
 from spikeloom.runtime.studies.robustness.exhaustive import certify, share_robust_to_one_event
 from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
-from spikeloom.runtime.studies.robustness.proofs.bounds import APART, REACH, lower_bound, needed
+from spikeloom.runtime.studies.robustness.proofs.bounds import PASTS, REACH, lower_bound, needed
 from spikeloom.runtime.studies.robustness.proofs.counting import least, tally_of
 from spikeloom.runtime.studies.robustness.proofs.entries import cells_of, channels_of
 from spikeloom.runtime.studies.robustness.results import Certificates
@@ -81,7 +81,7 @@ def test_where_a_register_may_overflow_every_change_is_run():
     netlist = replace(voting(large_netlist(3, proved=False)), taxels=20)
     assert overflows(netlist)
     machine, channels = machine_of(netlist), np.zeros((20, 3), np.uint8)
-    assert machine.groups(channels, 3, 0, np.array([1]), 1) is None
+    assert machine.groups(channels, 3, 0, 1) is None
     changes = single(every_cell(channels)[:5])
     assert_array_equal(
         machine.effects(channels, changes).votes, by_running(machine.votes, channels, changes).votes
@@ -92,24 +92,28 @@ def test_where_a_register_may_overflow_every_change_is_run():
 def test_no_past_and_no_future_make_a_group_turn_more_votes_than_its_bound(seed):
     rng = np.random.default_rng(seed)
     netlist = lively() if seed == 0 else small_netlist(seed)
-    inputs, steps, apart, reach = netlist.n_inputs, 40, np.array([1, 3, 6]), 8
+    inputs, steps, reach = netlist.n_inputs, 40, 8
+    pasts = [Past(1), Past(3), Past(6), Past(1, single=True), Past(3, single=True)]
     channels = sparse_events(rng, inputs, steps, rate=0.1)
     machine = machine_of(netlist)
     (spikes,) = kept(netlist, channels[None])[0]
     decision = int(machine.votes(channels[None])[0].argmax())
-    lag, lost = machine.groups(channels, steps, decision, apart, reach)
+    lag, lost, after = machine.groups(channels, steps, decision, reach)
     tight = 0
-    for _ in range(150):
-        t, level, count = rng.integers(steps), rng.integers(3), rng.integers(2)
+    for _ in range(250):
+        past, count = pasts[rng.integers(len(pasts))], rng.integers(2)
+        t = int(rng.integers(past.steps if past.single else 0, steps))
         later = rng.integers(1, reach + 1)
         runs = np.repeat(channels[None], 24, axis=0)
-        before = max(t - apart[level] + 1, 0)
+        before = max(t - past.steps + (not past.single), 0)
         runs[:, :, :before] = rng.random((24, inputs, before)) < rng.random((24, 1, 1))
         if later < reach:
             runs[:, :, t + later :] = rng.random((24, inputs, max(steps - t - later, 0))) < rng.random(
                 (24, 1, 1)
             )
         for each in runs:
+            if past.single:
+                each[rng.integers(inputs), before] ^= 1
             each[rng.choice(inputs, rng.integers(1, inputs + 1) if count else 1, replace=False), t] ^= 1
         window = slice(t + lag, t + lag + later if later < reach else None)
         others = kept(netlist, runs)[0][:, window].astype(np.int64)
@@ -117,8 +121,10 @@ def test_no_past_and_no_future_make_a_group_turn_more_votes_than_its_bound(seed)
         votes = np.stack(
             [more[:, netlist.readout_class == each].sum(axis=1) for each in range(netlist.classes)]
         )
+        sharp = after(past, t)
+        assert np.all(sharp <= lost[t])
         for each in set(range(netlist.classes)) - {decision}:
-            bound = lost[level, count, t, later - 1, each]
+            bound = sharp[count, later - 1, each]
             assert np.all(votes[each] - votes[decision] <= bound)
             tight += int(np.any(votes[each] - votes[decision] == bound))
     assert tight > 20 or seed == 0
@@ -138,8 +144,8 @@ def bounded(machine, one, most=8):
     votes = machine.votes(channels[None])[0]
     alone = machine.effects(channels, single(cells.cells))
     steps = int(cells.cells[-1, 1]) + 1
-    groups = machine.groups(channels, steps, int(votes.argmax()), APART, REACH)
-    return channels, cells, alone, votes, lower_bound(votes, groups, APART, most)
+    groups = machine.groups(channels, steps, int(votes.argmax()), REACH)
+    return channels, cells, alone, votes, lower_bound(votes, groups, PASTS, most).events
 
 
 def test_none_of_all_pairs_and_triples_breaks_what_is_proven_of_them():
@@ -156,7 +162,7 @@ def test_none_of_all_pairs_and_triples_breaks_what_is_proven_of_them():
                 broken.append(bool(np.any(found.argmax(axis=1) != votes.argmax())))
             assert broken == [False] * len(broken) or bound == 0
             proven.append(bound)
-    assert {0, 1, 2} <= set(proven)
+    assert {0, 1, 3} <= set(proven)
 
 
 def test_a_neuron_that_fires_by_itself_does_not_make_all_votes_doubtful():

@@ -429,12 +429,11 @@ class Machine(ABC):
         channels: EventArray,  # noqa: ARG002
         steps: int,  # noqa: ARG002
         decision: int,  # noqa: ARG002
-        apart: IntArray,  # noqa: ARG002
         reach: int,  # noqa: ARG002
     ) -> Groups | None:
         """Bounds of what changed events turn against the decision of a recording (channels, steps); None: not known.
 
-        Events may change in the first `steps`; `apart` (spacings,) rise from 1. See :class:`Groups`.
+        Events may change in the first `steps`. See :class:`Groups`.
         """
         return None
 

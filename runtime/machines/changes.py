@@ -38,15 +38,23 @@ class Effects(NamedTuple):
         return self.come - self.gone
 
 
+class Past(NamedTuple):
+    """What is known of the group of changed events before one."""
+
+    steps: int  # From it to this one, at least
+    single: bool = False  # Whether it was one event, exactly so many steps ago
+
+
 class Groups(NamedTuple):
     """What groups of changed events, each of one step, turn against a decision at most, whatever came before."""
 
     lag: int  # Steps from an event to the first vote that it can alter
-    # (spacings, 2, steps, reach, classes) int32; votes that the decision loses and a class gains from `lag` steps after
-    # the group until `lag` steps after the next: by how many steps ago the group before it was at least; by how many
-    # events it has (one, or more); by its step; and by how many steps later the next one comes, from 1, the last of
-    # them standing for later ones and for none
+    # (steps, reach, classes) int32; votes that the decision loses and a class gains from `lag` steps after the group
+    # until `lag` steps after the next, if nothing is known of the groups before it: by its step; and by how many steps
+    # later the next one comes, from 1, the last of them standing for later ones and for none
     lost: npt.NDArray[np.int32]
+    # The same of a group of a step (2, reach, classes), one event or more, by what is known of the group before it
+    after: Callable[[Past, int], npt.NDArray[np.int32]]
 
 
 def single(cells: IntArray) -> Changes:

@@ -254,9 +254,7 @@ class Loihi(Damageable, Explainable, Stoppable):
             self._chip, kernel.known_run(self._chip, channels), self.netlist.classes, changes
         )
 
-    def groups(
-        self, channels: EventArray, steps: int, decision: int, apart: IntArray, reach: int
-    ) -> Groups | None:
+    def groups(self, channels: EventArray, steps: int, decision: int, reach: int) -> Groups | None:
         """By interval arithmetic on registers."""
         if self._chip is None:
             return None
@@ -265,10 +263,9 @@ class Loihi(Damageable, Explainable, Stoppable):
 
         require_below("steps", np.array([steps]), channels.shape[1] + 1)
         require_below("class", np.array([decision]), self.netlist.classes)
-        require_below("spacing", apart, reach + 1)
         shape = self.netlist.taxels * self.netlist.polarities, steps, self.netlist.classes
         known = kernel.known_run(self._chip, channels)
-        return boxes.groups(self._chip, known, shape, decision, apart, reach)
+        return boxes.groups(self._chip, known, shape, decision, reach)
 
     def core_map(self, events: EventArray, lengths: IntArray, counts: IntArray) -> CoreMap:
         """Cores on the mesh."""

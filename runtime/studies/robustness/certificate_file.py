@@ -3,7 +3,8 @@
 An archive of :mod:`compiler.archive`. ``bins`` (channels, all steps) are those set in each step of each recording, one
 after another, bounded by ``step_bounds``. By recording ``decision``, ``unaltered`` (no so many events alter it) and
 ``rule`` (by which that can be checked); ``changes`` (changes, 2), channel and step of events that do alter it,
-by ``change_bounds``.
+by ``change_bounds``; ``pasts`` (groups, 3), what a proof tells apart of the past of a group: see ``Evidence``; by
+``past_bounds``.
 """
 
 import numpy as np
@@ -13,7 +14,7 @@ from spikeloom.runtime.studies.robustness.results import Certificates
 
 FORMAT = "spikeloom-certificate"
 
-VERSION = 1
+VERSION = 2
 
 
 def write_certificate(path: str, result: Certificates, netlist_sha256: str) -> None:
@@ -34,5 +35,7 @@ def write_certificate(path: str, result: Certificates, netlist_sha256: str) -> N
         "step_bounds": np.cumsum([0, *(each.bins.shape[1] for each in shown)]),
         "changes": np.concatenate([each.changes for each in shown]),
         "change_bounds": np.cumsum([0, *(len(each.changes) for each in shown)]),
+        "pasts": np.concatenate([each.pasts for each in shown]),
+        "past_bounds": np.cumsum([0, *(len(each.pasts) for each in shown)]),
     }
     write_archive(archive_bytes(manifest, arrays), path)

@@ -19,7 +19,7 @@ from spikeloom.runtime.machines.changes import PART, Effects, joined, single
 from spikeloom.runtime.studies.robustness.definition import TAXEL, Exhaustive
 from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
 from spikeloom.runtime.studies.robustness.proofs.attack import attack
-from spikeloom.runtime.studies.robustness.proofs.bounds import APART, REACH, lower_bound, needed
+from spikeloom.runtime.studies.robustness.proofs.bounds import PASTS, REACH, Proven, lower_bound, needed
 from spikeloom.runtime.studies.robustness.proofs.counting import Tally, least, tally_of
 from spikeloom.runtime.studies.robustness.proofs.entries import (
     Cells,
@@ -114,7 +114,8 @@ def certificate(
             kinds[kind.name], hanging = _decide_cases(machine, kind, events, shift, singles.decision)
             if kind.unit == TAXEL:
                 taxels[kind.name] = hanging
-    at_least, flips, rule = _bounds(machine, singles, most)
+    rule, flips, proven = _bounds(machine, singles, most)
+    at_least = proven.events
     at_most = int(cells.cost[flips].sum()) or None
     steps = max(int(cells.cells[-1, 1]) + 1, 1)
     phase = cells.cells[singles.altering, 1] * PHASES // steps
@@ -136,6 +137,7 @@ def certificate(
             unaltered=min(at_least, rule) if rule <= EACH else at_least,
             bins=np.where(cells.there, cells.cost, 0).reshape(steps, -1).T,
             changes=cells.cells[flips],
+            pasts=proven.pasts,
         ),
     )
 
@@ -170,7 +172,8 @@ def _flip_each(machine: Machine, events: Events, most: int, tally: Tally | None)
     decision = int(votes.argmax())
     counted = None if tally is None else least(tally, channels != 0, votes, cells, most)
     effects = None
-    if most == 1 and counted is None and _proven(machine, channels, votes, cells, 1) == {ANY: 1}:
+    by_bounds = _proven(machine, channels, votes, cells, 1) if most == 1 and counted is None else {}
+    if ANY in by_bounds and by_bounds[ANY].events == 1:
         decided = np.full(len(cells.cells), decision)
     else:
         alike = np.arange(len(cells.cells))
@@ -184,18 +187,19 @@ def _flip_each(machine: Machine, events: Events, most: int, tally: Tally | None)
     )
 
 
-def _proven(machine: Machine, channels: Events, votes: IntArray, cells: Cells, most: int) -> dict[int, int]:
+def _proven(
+    machine: Machine, channels: Events, votes: IntArray, cells: Cells, most: int
+) -> dict[int, Proven]:
     """Events, up to `most`, that are proven not to alter a decision, by rule; empty for a chip without bounds.
 
-    Of one event it does not ask how far groups are apart: that takes longer than to run each.
+    Of one event it does not ask what is known of the past: that takes longer than to run each.
     """
     steps = int(cells.cells[-1, 1]) + 1
-    rules = {ANY: 1} if most == 1 else {ANY: 1, NEAR: len(APART)}
-    apart = APART[: max(rules.values())]
-    groups = machine.groups(channels, steps, int(votes.argmax()), apart, REACH)
+    rules = {ANY: PASTS[:1]} if most == 1 else {ANY: PASTS[:1], NEAR: PASTS}
+    groups = machine.groups(channels, steps, int(votes.argmax()), REACH)
     if groups is None:
         return {}
-    return {rule: lower_bound(votes, groups, apart[:spacings], most) for rule, spacings in rules.items()}
+    return {rule: lower_bound(votes, groups, pasts, most) for rule, pasts in rules.items()}
 
 
 def _decide_flips(machine: Machine, kind: Exhaustive, singles: _Singles) -> tuple[Decided, tuple[int, ...]]:
@@ -232,36 +236,42 @@ def _decide_cases(
     return decided_first, tuple(each[0] for each, _ in altering)
 
 
-def _bounds(machine: Machine, singles: _Singles, most: int) -> tuple[int, IntArray, int]:
-    """How many changed events alter nothing, entries whose flips alter the decision, none if unknown, and the rule."""
+def _bounds(machine: Machine, singles: _Singles, most: int) -> tuple[int, IntArray, Proven]:
+    """The rule, entries whose flips alter the decision, none if unknown, and how many changed events alter nothing."""
     cells = singles.cells
     flips = singles.altering[:1]
+    proven = Proven(1)
     rule = EACH
     if len(flips):
-        at_least = rule = 0
+        proven = Proven(0)
+        rule = 0
     elif singles.counted is not None:
         at_least, fewest = singles.counted
+        proven = Proven(at_least)
         rule = COUNTS
         flips = flips if fewest is None else fewest
     elif singles.effects is None:
-        at_least, rule = 1, ANY
+        rule = ANY
     else:
-        at_least, flips, rule = _several(machine, singles, singles.effects, most)
+        rule, flips, proven = _several(machine, singles, singles.effects, most)
     if len(flips):
         changed = machine.effects(singles.channels, joined([cells.cells[flips]])).votes + singles.votes
         if changed.argmax() == singles.decision:
             flips = flips[:0]
-    return at_least, flips, rule
+    return rule, flips, proven
 
 
-def _several(machine: Machine, singles: _Singles, effects: Effects, most: int) -> tuple[int, IntArray, int]:
+def _several(
+    machine: Machine, singles: _Singles, effects: Effects, most: int
+) -> tuple[int, IntArray, Proven]:
     """The same where no single event alters the decision; only these are known of a chip that has no bounds."""
-    proven = {} if most == 1 else _proven(machine, singles.channels, singles.votes, singles.cells, most)
-    if not proven:
-        return 1, np.zeros(0, np.int64), EACH
-    at_least = max(1, *proven.values())
-    rule = next((rule for rule, events in proven.items() if events == at_least), EACH)
-    return at_least, attack(machine, singles.channels, singles.votes, singles.cells, effects), rule
+    by_rule = {} if most == 1 else _proven(machine, singles.channels, singles.votes, singles.cells, most)
+    if not by_rule:
+        return EACH, np.zeros(0, np.int64), Proven(1)
+    rule, proven = max(by_rule.items(), key=lambda each: each[1].events)
+    if proven.events < 1:
+        rule, proven = EACH, Proven(1)
+    return rule, attack(machine, singles.channels, singles.votes, singles.cells, effects), proven
 
 
 def share_robust_to_one_event(machine: Machine, data: Recordings) -> float:

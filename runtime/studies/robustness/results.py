@@ -175,6 +175,7 @@ class Evidence:
     unaltered: int
     bins: IntArray  # (channels, steps) int64; bins of the recording that are set in each step of the network
     changes: IntArray  # (changes, 2) int64; channel and step
+    pasts: IntArray  # (groups, 3) int64; what a proof knows of the past of a group: see ``proofs.bounds.Proven``
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

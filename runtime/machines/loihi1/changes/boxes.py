@@ -1,7 +1,8 @@
 """What groups of changed events can turn when little is known of the past: interval arithmetic on the chip's integers.
 
 A *group* is all that changes in one step. Of the past only this is known: the groups before it are at least
-so many steps ago. From there on the events are those of the known recording. Each place has a least and a
+so many steps ago, or the last of them was one event, so many steps ago. From there on the events are those of the
+known recording, and of runs with one event each the widest bounds are taken. Each place has a least and a
 largest membrane and current; a spike is sure, impossible or open; open spikes widen the sums that they
 reach. Decay is monotone, so that bounds stay bounds. A run is over once every membrane is :mod:`changes.safe`.
 """
@@ -18,11 +19,12 @@ from spikeloom.compiler.layer_kernel import (
     compiled,
     compiled_and_cached,
     copy,
+    require_below,
     saturated,
 )
 from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.types import AnyArray, IntArray
-from spikeloom.runtime.machines.changes import Groups
+from spikeloom.runtime.machines.changes import Groups, Past
 from spikeloom.runtime.machines.loihi1.changes.chip import LANES, NEVER, Chip, Known
 from spikeloom.runtime.machines.loihi1.changes.kernel import integrate
 from spikeloom.runtime.machines.loihi1.changes.safe import FAR, Safe, safe, unsafe
@@ -31,24 +33,31 @@ HORIZON = 512
 """Steps after a group for which its run is followed; of the rest every vote counts as turned."""
 
 
-def groups(
-    chip: Chip, known: Known, shape: tuple[int, int, int], decision: int, apart: IntArray, reach: int
-) -> Groups:
+def groups(chip: Chip, known: Known, shape: tuple[int, int, int], decision: int, reach: int) -> Groups:
     """Bound what groups of events turn; `shape` are channels and steps in which events may change, and classes."""
     channels, steps, classes = shape
     places = len(chip.bias)
     sources = places + 2 * len(known.events)
-    lost = np.full((len(apart), 2, steps, reach, classes), -FAR, np.int32)
-    blocks = np.zeros((2, len(chip.depth)), np.uint8)
-    registers = np.zeros((10, places), np.int32)
-    lists = np.zeros((4, sources), np.int64)
+    blocks = np.zeros((3, len(chip.depth)), np.uint8)
+    registers = np.zeros((14, places), np.int32)
+    lists = np.zeros((6, sources), np.int64)
     codes = np.zeros(places, np.uint8)
     base = _Base._make([*registers[:4], *lists[:2], blocks[0]])
-    work = _Work._make([*registers[4:], *lists[2:], codes, blocks[1], np.zeros(classes, np.int64)])
+    hull = _Base._make([*registers[4:8], *lists[2:4], blocks[1]])
+    work = _Work._make([*registers[8:], *lists[4:], codes, blocks[2], np.zeros(classes, np.int64)])
     lag = lag_of(chip, known)
+    bounds = safe(chip, known)
     left = _left(chip, known, classes)
-    _bound(chip, known, safe(chip, known), left, channels, decision, apart, lag, base, work, lost)
-    return Groups(lag, lost)
+    lost = np.full((steps, reach, classes), -FAR, np.int32)
+    _bound(chip, known, bounds, left, channels, decision, lag, base, work, lost)
+
+    def after(past: Past, step: int) -> AnyArray:
+        require_below("step", np.array([step, step - past.steps * past.single]), steps)
+        found = np.full((2, reach, classes), -FAR, np.int32)
+        _bound_after(chip, known, bounds, left, channels, decision, lag, past, step, base, hull, work, found)
+        return found
+
+    return Groups(lag, lost, after)
 
 
 class _Base(NamedTuple):
@@ -264,7 +273,7 @@ def _copy_state(source: Any, target: Any, n: Any) -> None:
 
 
 @compiled
-def _past(chip: Chip, known: Known, bounds: Safe, start: Any, t: Any, base: Any, work: Any) -> Any:
+def _past(chip: Chip, known: Known, start: Any, t: Any, base: Any, work: Any) -> Any:
     """Bounds before step `t` where nothing is known of what was before `start`; spikes that are open then."""
     n = 0
     clear(work.low)
@@ -282,9 +291,14 @@ def _past(chip: Chip, known: Known, bounds: Safe, start: Any, t: Any, base: Any,
             for block in range(len(chip.depth)):
                 n = _step(chip, known, work, s, block, n)
         _copy_state(work, base, n)
+    return n
+
+
+@compiled
+def _watch(chip: Chip, known: Known, bounds: Safe, t: Any, base: Any) -> None:
+    """Blocks in which a membrane is not safe before a step."""
     for block in range(len(chip.depth)):
         base.live[block] = unsafe(chip, known, bounds, _box(base), t, block)
-    return n
 
 
 @compiled
@@ -358,6 +372,8 @@ def _follow(
     reach = len(lost)
     gone = 0
     clear(work.turned)
+    clear(work.low)
+    clear(work.high)
     _arrive(chip, work, n)
     for block in range(len(chip.depth)):
         first = np.uint64(block * LANES)
@@ -384,6 +400,68 @@ def _follow(
     return over or t == steps
 
 
+@compiled
+def _hull(
+    chip: Chip, known: Known, start: Any, t: Any, channels: Any, n: Any, base: Any, work: Any, hull: Any
+) -> Any:
+    """Bounds before step `t` of all runs in which one event of step `start` changes; spikes that are open then.
+
+    `base` are the bounds before `start`, and from here on those before `t`.
+    """
+    clear(hull.kind)
+    count = 0
+    for source in range(channels):
+        clear(work.low)
+        clear(work.high)
+        _copy_state(base, work, n)
+        work.listed[n] = source
+        work.kind[n] = -1 if known.events[source, start] else 1
+        m = n + 1
+        for s in range(start, t):
+            _arrive(chip, work, m)
+            m = 0
+            for block in range(len(chip.depth)):
+                m = _step(chip, known, work, s, block, m)
+        if source == 0:
+            _copy_state(work, hull, 0)
+        _lower(work.low_u, hull.low_u)
+        _raise(work.high_u, hull.high_u)
+        _lower(work.low_v, hull.low_v)
+        _raise(work.high_v, hull.high_v)
+        for k in range(m):
+            if hull.kind[work.listed[k]] == 0:
+                hull.kind[work.listed[k]] = -2 if work.kind[k] < 0 else 2
+                hull.listed[count] = work.listed[k]
+                count += 1
+    _copy_state(hull, base, 0)
+    for k in range(count):
+        base.listed[k] = hull.listed[k]
+        base.kind[k] = hull.kind[hull.listed[k]]
+    return count
+
+
+@compiled
+def _lower(values: Any, least: Any) -> None:
+    for i in range(len(values)):
+        least[i] = min(least[i], values[i])
+
+
+@compiled
+def _raise(values: Any, most: Any) -> None:
+    for i in range(len(values)):
+        most[i] = max(most[i], values[i])
+
+
+@compiled
+def _change_any(known: Known, channels: Any, t: Any, n: Any, base: Any, work: Any) -> Any:
+    """A run from bounds before a step in which any of its events may change."""
+    _copy_state(base, work, n)
+    for source in range(channels):
+        work.listed[n + source] = source
+        work.kind[n + source] = -2 if known.events[source, t] else 2
+    return n + channels
+
+
 @compiled_and_cached
 def _bound(
     chip: Chip,
@@ -392,28 +470,46 @@ def _bound(
     left: Any,
     channels: Any,
     decision: Any,
-    apart: Any,
     lag: Any,
     base: Any,
     work: Any,
     lost: Any,
 ) -> None:
-    for t in range(lost.shape[2]):
-        for level in range(len(apart)):
-            n = _past(chip, known, bounds, t - apart[level] + 1, t, base, work)
-            _copy_state(base, work, n)
-            for source in range(channels):
-                work.listed[n + source] = source
-                work.kind[n + source] = -2 if known.events[source, t] else 2
-            every = lost[level, 1, t]
-            ended = _follow(chip, known, bounds, left, t, n + channels, decision, lag, base, work, every)
-            if apart[level] == 1 or not ended:  # one event alone can do no more than all
-                copy(every.ravel(), lost[level, 0, t].ravel())
-                continue
-            for source in range(channels):
-                clear(work.low)
-                clear(work.high)
-                _copy_state(base, work, n)
-                work.listed[n] = source
-                work.kind[n] = -1 if known.events[source, t] else 1
-                _follow(chip, known, bounds, left, t, n + 1, decision, lag, base, work, lost[level, 0, t])
+    for t in range(len(lost)):
+        n = _past(chip, known, t, t, base, work)
+        _watch(chip, known, bounds, t, base)
+        n = _change_any(known, channels, t, n, base, work)
+        _follow(chip, known, bounds, left, t, n, decision, lag, base, work, lost[t])
+
+
+@compiled_and_cached
+def _bound_after(
+    chip: Chip,
+    known: Known,
+    bounds: Safe,
+    left: Any,
+    channels: Any,
+    decision: Any,
+    lag: Any,
+    past: Any,
+    t: Any,
+    base: Any,
+    hull: Any,
+    work: Any,
+    lost: Any,
+) -> None:
+    if past.single:
+        n = _past(chip, known, t - past.steps, t - past.steps, base, work)
+        n = _hull(chip, known, t - past.steps, t, channels, n, base, work, hull)
+    else:
+        n = _past(chip, known, t - past.steps + 1, t, base, work)
+    _watch(chip, known, bounds, t, base)
+    m = _change_any(known, channels, t, n, base, work)
+    if not _follow(chip, known, bounds, left, t, m, decision, lag, base, work, lost[1]):
+        copy(lost[1].ravel(), lost[0].ravel())  # one event alone can do no more than all
+        return
+    for source in range(channels):
+        _copy_state(base, work, n)
+        work.listed[n] = source
+        work.kind[n] = -1 if known.events[source, t] else 1
+        _follow(chip, known, bounds, left, t, n + 1, decision, lag, base, work, lost[0])

@@ -1,23 +1,34 @@
 """How many events must at least change until a decision does: a sound lower bound, by what the chip forgets.
 
 Changed events come in groups, one a step. The votes from where a group can be seen until the next can be are
-lost to this group. How many they are at most, :class:`Groups` says, by how long ago the group before it was:
-nothing more is assumed of the past. A dynamic program over steps, spacings and events finds the worst of all.
-Each vote is counted for one group; those before the first group can be seen are the known ones.
+lost to this group. How many they are at most, :class:`Groups` says, by what is known of the group before it:
+nothing more is assumed of the past. A dynamic program over steps, pasts and events finds the worst of all.
+Each vote is counted for one group; those before the first group can be seen are the known ones. What is known of
+the past is left out at first, and counted where a group of the worst of all needs it, until none does.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from spikeloom.compiler.types import IntArray
-from spikeloom.runtime.machines.changes import Groups
+from spikeloom.compiler.types import AnyArray, IntArray
+from spikeloom.runtime.machines.changes import Groups, Past
 
-APART = np.array([1, 5, 7])
-"""Steps from a group to the one before it, at least, for which bounds are worked out."""
+PASTS = (*(Past(steps) for steps in range(1, 8)), *(Past(steps, single=True) for steps in range(1, 4)))
+"""What is told apart of the group before one."""
 
 REACH = 12
-"""Steps to the next group that are told apart; no less than the last of these."""
+"""Steps to the next group that are told apart; no less than any of these."""
+
+
+class Proven(NamedTuple):
+    """Most events of which it is proven that no so many alter a decision, and what that rests on."""
+
+    events: int
+    # (groups, 3) int64; what is known of the past of a group, see :class:`Past`, and its step; of all others nothing
+    pasts: IntArray = np.zeros((0, 3), np.int64)
 
 
 def needed(votes: IntArray) -> tuple[int, IntArray]:
@@ -32,18 +43,42 @@ def needed(votes: IntArray) -> tuple[int, IntArray]:
     return decision, gaps
 
 
-def lower_bound(votes: IntArray, groups: Groups, apart: IntArray, most: int) -> int:
+def lower_bound(votes: IntArray, groups: Groups, pasts: tuple[Past, ...], most: int) -> Proven:
     """Most events, up to `most`, of which it is proven that no so many alter the decision of votes (classes,)."""
     from spikeloom.runtime.studies.robustness.proofs.worst import (
-        most_lost,
+        fewest,
     )  # with numba, which help need not wait for
 
-    assert apart[0] == 1, "a group may follow another in the next step"
+    assert pasts[0] == Past(1), "a group may follow another in the next step"
     decision, gaps = needed(votes)
+    last = max(index for index, past in enumerate(pasts) if not past.single)
+    follows = np.array([[_known(pasts, r, single) for r in range(REACH)] for single in (True, False)])
+    known: dict[tuple[int, int], AnyArray] = {}
     certified = most
     for other in np.argsort(gaps, kind="stable").tolist():
-        if other != decision and certified > 0:
-            of_class = np.ascontiguousarray(groups.lost[: len(apart), ..., other])
-            lost = most_lost(of_class, apart, certified)
-            certified = min(certified, int(np.searchsorted(lost, gaps[other])) - 1)
-    return certified
+        if other == decision:
+            continue
+        lost = np.broadcast_to(groups.lost[..., other], (len(pasts), 2, *groups.lost.shape[:2])).copy()
+        for (past, step), each in known.items():
+            lost[past, :, step] = each[..., other]
+        while True:
+            events, chain = fewest(lost, follows, last, certified, gaps[other])
+            unknown = {(past, step) for past, step in chain.tolist() if past} - known.keys()
+            if not unknown:
+                break
+            for past, step in sorted(unknown):
+                known[past, step] = groups.after(pasts[past], step)
+                lost[past, :, step] = known[past, step][..., other]
+        certified = min(certified, events - 1)
+    rests_on = [(*pasts[past], step) for past, step in sorted(known)]
+    return Proven(certified, np.array(rests_on, np.int64).reshape(-1, 3))
+
+
+def _known(pasts: tuple[Past, ...], steps: int, single: bool) -> int:
+    """Which of the pasts says most of a group so many steps ago."""
+    exact = Past(steps, single=True)
+    if single and exact in pasts:
+        return pasts.index(exact)
+    return max(
+        (index for index, past in enumerate(pasts) if not past.single and past.steps <= steps), default=0
+    )

@@ -13,42 +13,74 @@ NEVER = -(1 << 40)
 
 
 @compiled
-def _leave(enter: Any, late: Any, worst: Any, lost: Any, level: Any, t: Any, n: Any, before: Any) -> None:
-    """Let a group have been at a step, which makes `n` events in all: votes until the next one, wherever it is."""
+def _leave(
+    enter: Any, came: Any, late: Any, ours: Any, follows: Any, votes: Any, entry: Any, t: Any, n: Any
+) -> None:
+    """Let a group have been at a step, which makes `n` events in all: votes until the next one, wherever it is.
+
+    `entry` says by which way the group was entered.
+    """
     steps = len(enter)
-    reach = len(lost)
+    reach = len(ours)
     for r in range(1, reach):
-        if t + r < steps:
-            enter[t + r, level[r], n] = max(enter[t + r, level[r], n], before + lost[r - 1])
-    if t + reach < steps:
-        late[t + reach, n] = max(late[t + reach, n], before + lost[reach - 1])
-    worst[n] = max(worst[n], before + lost[reach - 1])
+        if t + r < steps and votes + ours[r - 1] > enter[t + r, follows[r], n]:
+            enter[t + r, follows[r], n] = votes + ours[r - 1]
+            came[t + r, follows[r], n] = entry
+    after = min(t + reach, steps)
+    if votes + ours[reach - 1] > late[after, n, 0]:
+        late[after, n, 0] = votes + ours[reach - 1]
+        late[after, n, 1] = entry
+
+
+@compiled
+def _way(came: Any, late: Any, steps: Any, n: Any) -> Any:
+    """What is known of the past of each group of the worst chain of `n` events, and its step, last one first."""
+    chain = np.zeros((n, 2), np.int64)
+    entry = late[steps, n, 1]
+    count = 0
+    while entry >= 0:
+        events = entry % 2 + 1
+        past = entry // 2 % came.shape[1]
+        t = entry // 2 // came.shape[1]
+        chain[count, 0] = past
+        chain[count, 1] = t
+        count += 1
+        n -= events
+        entry = came[t, past, n]
+    return chain[:count]
 
 
 @compiled_and_cached
-def most_lost(lost: Any, apart: Any, most: int) -> Any:
-    """Most votes that so many changed events turn against a decision, (most + 1,).
+def fewest(lost: Any, follows: Any, last: int, most: int, gap: int) -> Any:
+    """Fewest events, up to `most`, that may turn so many votes, and how, (groups, 2); else most + 1 and none.
 
-    `lost` (spacings, 2, steps, reach) are those of one class, see :class:`machines.changes.Groups`. `enter` holds
-    them where a group is at a step, its own not counted yet, by how far the one before it is away; `late`
-    those of which the one before is as far away as any spacing.
+    `lost` (pasts, 2, steps, reach) are the votes of one class, see :class:`machines.changes.Groups`, `follows` (2,
+    reach) what is known of a group by the events of the one before it and its distance, `last` if that is farther.
+    A way is what is known of the past of each group and its step. `enter` holds the most votes turned where a group is
+    at a step, its own not counted yet; `came` the group before it; `late` both where that is as far away as any.
     """
-    levels, _, steps, reach = lost.shape
-    enter = np.full((steps, levels, most + 1), NEVER)
-    late = np.full((steps, most + 1), NEVER)
-    worst = np.zeros(most + 1, np.int64)
-    level = np.searchsorted(apart, np.arange(reach), side="right") - 1
-    for t in range(steps):
-        late[t, 0] = 0
+    pasts, _, steps, _ = lost.shape
+    enter = np.full((steps, pasts, most + 1), NEVER)
+    came = np.full((steps, pasts, most + 1), -1)
+    late = np.full((steps + 1, most + 1, 2), NEVER)
+    late[0, 0, 0] = 0
+    late[0, 0, 1] = -1
+    for t in range(steps + 1):
         for n in range(most + 1):
-            late[t, n] = max(late[t, n], late[max(t - 1, 0), n])
-            enter[t, levels - 1, n] = max(enter[t, levels - 1, n], late[t, n])
-        for k in range(levels):
+            if t > 0 and late[t - 1, n, 0] >= late[t, n, 0]:
+                late[t, n] = late[t - 1, n]
+            if t < steps and late[t, n, 0] > enter[t, last, n]:
+                enter[t, last, n] = late[t, n, 0]
+                came[t, last, n] = late[t, n, 1]
+        for past in range(pasts if t < steps else 0):
             for events in range(1, 3):
                 for n in range(most + 1 - events):
-                    if enter[t, k, n] > NEVER // 2:
-                        ours = lost[k, events - 1, t]
-                        _leave(enter, late, worst, ours, level, t, n + events, enter[t, k, n])
+                    votes = enter[t, past, n]
+                    entry = 2 * (t * pasts + past) + events - 1
+                    if votes > NEVER // 2:
+                        ours = lost[past, events - 1, t]
+                        _leave(enter, came, late, ours, follows[events - 1], votes, entry, t, n + events)
     for n in range(1, most + 1):
-        worst[n] = max(worst[n], worst[n - 1])
-    return worst
+        if late[steps, n, 0] >= gap:
+            return n, _way(came, late, steps, n)
+    return most + 1, np.zeros((0, 2), np.int64)
