@@ -259,13 +259,13 @@ class Loihi(Damageable, Explainable, Stoppable):
         if self._chip is None:
             return None
         from spikeloom.compiler.layer_kernel import require_below
-        from spikeloom.runtime.machines.loihi1.changes import boxes, kernel
+        from spikeloom.runtime.machines.loihi1.changes import groups, kernel
 
         require_below("steps", np.array([steps]), channels.shape[1] + 1)
         require_below("class", np.array([decision]), self.netlist.classes)
         shape = self.netlist.taxels * self.netlist.polarities, steps, self.netlist.classes
         known = kernel.known_run(self._chip, channels)
-        return boxes.groups(self._chip, known, shape, decision, reach)
+        return groups.groups(self._chip, known, shape, decision, reach)
 
     def core_map(self, events: EventArray, lengths: IntArray, counts: IntArray) -> CoreMap:
         """Cores on the mesh."""

@@ -13,54 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spikeloom.compiler.layer_kernel import (
-    charged,
-    clear,
-    compiled,
-    compiled_and_cached,
-    copy,
-    require_below,
-    saturated,
-)
+from spikeloom.compiler.layer_kernel import charged, clear, compiled, copy, saturated
 from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.types import AnyArray, IntArray
-from spikeloom.runtime.machines.changes import Groups, Past
 from spikeloom.runtime.machines.loihi1.changes.chip import LANES, NEVER, Chip, Known
 from spikeloom.runtime.machines.loihi1.changes.kernel import integrate
-from spikeloom.runtime.machines.loihi1.changes.safe import FAR, Safe, safe, unsafe
-
-HORIZON = 512
-"""Steps after a group for which its run is followed; of the rest every vote counts as turned."""
+from spikeloom.runtime.machines.loihi1.changes.safe import Safe, unsafe
 
 
-def groups(chip: Chip, known: Known, shape: tuple[int, int, int], decision: int, reach: int) -> Groups:
-    """Bound what groups of events turn; `shape` are channels and steps in which events may change, and classes."""
-    channels, steps, classes = shape
-    places = len(chip.bias)
-    sources = places + 2 * len(known.events)
-    blocks = np.zeros((3, len(chip.depth)), np.uint8)
-    registers = np.zeros((14, places), np.int32)
-    lists = np.zeros((6, sources), np.int64)
-    codes = np.zeros(places, np.uint8)
-    base = _Base._make([*registers[:4], *lists[:2], blocks[0]])
-    hull = _Base._make([*registers[4:8], *lists[2:4], blocks[1]])
-    work = _Work._make([*registers[8:], *lists[4:], codes, blocks[2], np.zeros(classes, np.int64)])
-    lag = lag_of(chip, known)
-    bounds = safe(chip, known)
-    left = _left(chip, known, classes)
-    lost = np.full((steps, reach, classes), -FAR, np.int32)
-    _bound(chip, known, bounds, left, channels, decision, lag, base, work, lost)
-
-    def after(past: Past, step: int) -> AnyArray:
-        require_below("step", np.array([step, step - past.steps * past.single]), steps)
-        found = np.full((2, reach, classes), -FAR, np.int32)
-        _bound_after(chip, known, bounds, left, channels, decision, lag, past, step, base, hull, work, found)
-        return found
-
-    return Groups(lag, lost, after)
-
-
-class _Base(NamedTuple):
+class Base(NamedTuple):
     """Bounds before a step, and spikes that are open then."""
 
     # low_u, high_u, low_v, high_v: (places,) int32
@@ -73,7 +34,7 @@ class _Base(NamedTuple):
     live: AnyArray  # (blocks,) uint8; in which a membrane is not safe
 
 
-class _Work(NamedTuple):
+class Work(NamedTuple):
     """A run with a group."""
 
     low_u: AnyArray
@@ -89,35 +50,6 @@ class _Work(NamedTuple):
     codes: AnyArray  # (places,) uint8; 3 for a sure spike, 2 for an open one
     live: AnyArray  # (blocks,) uint8; that are simulated
     turned: IntArray  # (classes,) int64; votes gained
-
-
-def lag_of(chip: Chip, known: Known) -> int:
-    """Least number of synapses on a path from an input to a compartment that votes, minus one."""
-    begins, target, offset, _ = chip.synapses
-    channels = len(known.events)
-    lag = 0
-    reached = np.arange(len(begins) - 1) < channels
-    while lag < len(known.fired) and not np.any(chip.label[reached[channels:]] >= 0):
-        lag += 1
-        for source in np.flatnonzero(reached):
-            for r in range(begins[source], begins[source + 1]):
-                reached[channels + target[r] : channels + target[r] + offset[r + 1] - offset[r]] = True
-    return max(lag - 1, 0)
-
-
-def _left(chip: Chip, known: Known, classes: int) -> IntArray:
-    """Votes that can still go, and come, from each step on, (2, steps + 1, classes)."""
-    steps = len(known.fired)
-    left = np.zeros((2, steps + 1, classes), np.int64)
-    voters = np.flatnonzero(chip.label >= 0)
-    depth = np.repeat(chip.depth, LANES)[voters]
-    for t in range(steps - 1, -1, -1):
-        left[:, t] = left[:, t + 1]
-        inside = (depth <= t) & (t < depth + known.events.shape[1])
-        fired = known.fired[t, voters] != 0
-        np.add.at(left[0, t], chip.label[voters[fired & inside]], 1)
-        np.add.at(left[1, t], chip.label[voters[~fired & inside]], 1)
-    return left
 
 
 # Each loop is a function of its own that writes one array: only so does the compiler vectorise it.
@@ -156,7 +88,8 @@ def _reset_high(high: Any, codes: Any, threshold: Any, first: Any) -> None:
 
 
 @compiled
-def _any(values: Any, first: Any) -> Any:
+def any_of(values: Any, first: Any) -> Any:
+    """Whether a block has a value that is not zero."""
     found = np.int32(0)
     for i in range(first, first + np.uint64(LANES)):
         found |= values[i]
@@ -188,7 +121,7 @@ def _both(total: Any, weight: Any, sign: Any, first: Any, begin: Any, length: An
 
 
 @compiled
-def _arrive(chip: Chip, work: Any, n: Any) -> None:
+def arrive(chip: Chip, work: Any, n: Any) -> None:
     """Let spikes arrive that differ, or may."""
     begins, target, offset, weight = chip.synapses
     for k in range(n):
@@ -208,7 +141,7 @@ def _arrive(chip: Chip, work: Any, n: Any) -> None:
 
 
 @compiled
-def _step(chip: Chip, known: Known, work: Any, t: Any, block: Any, n: Any) -> Any:
+def step_block(chip: Chip, known: Known, work: Any, t: Any, block: Any, n: Any) -> Any:
     """One step of a block; lists what spikes otherwise, or may, after `n` others."""
     first = np.uint64(block * LANES)
     channels, length = known.events.shape
@@ -238,7 +171,8 @@ def _step(chip: Chip, known: Known, work: Any, t: Any, block: Any, n: Any) -> An
 
 
 @compiled
-def _box(of: Any) -> Any:
+def box_of(of: Any) -> Any:
+    """Bounds of currents and membranes, as :func:`safe.unsafe` takes them."""
     return of.low_u, of.high_u, of.low_v, of.high_v
 
 
@@ -263,7 +197,8 @@ def _unknown(chip: Chip, known: Known, start: Any, work: Any) -> Any:
 
 
 @compiled
-def _copy_state(source: Any, target: Any, n: Any) -> None:
+def copy_state(source: Any, target: Any, n: Any) -> None:
+    """Copy bounds and the first `n` spikes that are open."""
     copy(source.low_u, target.low_u)
     copy(source.high_u, target.high_u)
     copy(source.low_v, target.low_v)
@@ -273,7 +208,7 @@ def _copy_state(source: Any, target: Any, n: Any) -> None:
 
 
 @compiled
-def _past(chip: Chip, known: Known, start: Any, t: Any, base: Any, work: Any) -> Any:
+def past_of(chip: Chip, known: Known, start: Any, t: Any, base: Any, work: Any) -> Any:
     """Bounds before step `t` where nothing is known of what was before `start`; spikes that are open then."""
     n = 0
     clear(work.low)
@@ -286,122 +221,23 @@ def _past(chip: Chip, known: Known, start: Any, t: Any, base: Any, work: Any) ->
     else:
         n = _unknown(chip, known, start, work)
         for s in range(start, t):
-            _arrive(chip, work, n)
+            arrive(chip, work, n)
             n = 0
             for block in range(len(chip.depth)):
-                n = _step(chip, known, work, s, block, n)
-        _copy_state(work, base, n)
+                n = step_block(chip, known, work, s, block, n)
+        copy_state(work, base, n)
     return n
 
 
 @compiled
-def _watch(chip: Chip, known: Known, bounds: Safe, t: Any, base: Any) -> None:
+def watch(chip: Chip, known: Known, bounds: Safe, t: Any, base: Any) -> None:
     """Blocks in which a membrane is not safe before a step."""
     for block in range(len(chip.depth)):
-        base.live[block] = unsafe(chip, known, bounds, _box(base), t, block)
+        base.live[block] = unsafe(chip, known, bounds, box_of(base), t, block)
 
 
 @compiled
-def _count(chip: Chip, known: Known, t: Any, decision: Any, work: Any, n: Any) -> Any:
-    """Votes that other classes gain, and that the decision loses, at worst, in a step."""
-    lost = np.int64(0)
-    channels = len(known.events)
-    for k in range(n):
-        c = work.listed[k] - channels
-        label = chip.label[c]
-        fired = known.fired[t, c]
-        if label >= 0:
-            if label == decision:
-                lost += np.int64(fired) - np.int64(work.codes[c] == 3)
-            else:
-                work.turned[label] += np.int64(work.codes[c] >= 2) - np.int64(fired)
-    return lost
-
-
-@compiled
-def _note(lost: Any, turned: Any, gone: Any, first: Any, last: Any) -> None:
-    for r in range(max(first, 0), last):
-        for label in range(len(turned)):
-            lost[r, label] = max(lost[r, label], turned[label] + gone)
-
-
-@compiled
-def _advance(chip: Chip, known: Known, bounds: Safe, work: Any, t: Any) -> Any:
-    """One step of all blocks that are simulated; which of them need not be any more; how many spikes differ, or may."""
-    n = 0
-    clear_above = True  # nothing comes from layers before that is not known
-    layer_clear = True
-    for block in range(len(chip.depth)):
-        if block and chip.layer[block] != chip.layer[block - 1]:
-            clear_above = layer_clear and n == 0
-            layer_clear = clear_above
-        if work.live[block]:
-            n = _step(chip, known, work, t, block, n)
-            if (clear_above and chip.ordered) and not unsafe(chip, known, bounds, _box(work), t + 1, block):
-                work.live[block] = 0
-            else:
-                layer_clear = False
-    return n
-
-
-@compiled
-def _over(chip: Chip, known: Known, bounds: Safe, work: Any, t: Any) -> Any:
-    """Whether every block is safe."""
-    for block in range(len(chip.depth)):
-        if work.live[block] and (chip.ordered or unsafe(chip, known, bounds, _box(work), t, block)):
-            return False
-    return True
-
-
-@compiled
-def _follow(
-    chip: Chip,
-    known: Known,
-    bounds: Safe,
-    left: Any,
-    start: Any,
-    n: Any,
-    decision: Any,
-    lag: Any,
-    base: Any,
-    work: Any,
-    lost: Any,
-) -> Any:
-    """Run on from a step, whose sums have what its group adds; notes votes that are lost; whether the run ended."""
-    steps = len(known.sums)
-    reach = len(lost)
-    gone = 0
-    clear(work.turned)
-    clear(work.low)
-    clear(work.high)
-    _arrive(chip, work, n)
-    for block in range(len(chip.depth)):
-        first = np.uint64(block * LANES)
-        reached = _any(work.low, first) or _any(work.high, first)
-        work.live[block] = base.live[block] or reached or not chip.outer[block]
-    t = start
-    over = False
-    while True:
-        n = _advance(chip, known, bounds, work, t)
-        if t >= start + lag:
-            gone += _count(chip, known, t, decision, work, n)
-        t += 1
-        over = n == 0 and _over(chip, known, bounds, work, t)
-        r = min(t - start - lag, reach)  # a next group so many steps later cannot alter what was until now
-        if over or t == steps or t == start + HORIZON:
-            break
-        _note(lost, work.turned, gone, r - 1, r)
-        _arrive(chip, work, n)
-    if not over and t < steps:
-        gone += left[0, t, decision]
-        for label in range(len(work.turned)):
-            work.turned[label] += left[1, t, label]
-    _note(lost, work.turned, gone, r - 1, reach)
-    return over or t == steps
-
-
-@compiled
-def _hull(
+def hull_of(
     chip: Chip, known: Known, start: Any, t: Any, channels: Any, n: Any, base: Any, work: Any, hull: Any
 ) -> Any:
     """Bounds before step `t` of all runs in which one event of step `start` changes; spikes that are open then.
@@ -413,17 +249,17 @@ def _hull(
     for source in range(channels):
         clear(work.low)
         clear(work.high)
-        _copy_state(base, work, n)
+        copy_state(base, work, n)
         work.listed[n] = source
         work.kind[n] = -1 if known.events[source, start] else 1
         m = n + 1
         for s in range(start, t):
-            _arrive(chip, work, m)
+            arrive(chip, work, m)
             m = 0
             for block in range(len(chip.depth)):
-                m = _step(chip, known, work, s, block, m)
+                m = step_block(chip, known, work, s, block, m)
         if source == 0:
-            _copy_state(work, hull, 0)
+            copy_state(work, hull, 0)
         _lower(work.low_u, hull.low_u)
         _raise(work.high_u, hull.high_u)
         _lower(work.low_v, hull.low_v)
@@ -433,7 +269,7 @@ def _hull(
                 hull.kind[work.listed[k]] = -2 if work.kind[k] < 0 else 2
                 hull.listed[count] = work.listed[k]
                 count += 1
-    _copy_state(hull, base, 0)
+    copy_state(hull, base, 0)
     for k in range(count):
         base.listed[k] = hull.listed[k]
         base.kind[k] = hull.kind[hull.listed[k]]
@@ -450,66 +286,3 @@ def _lower(values: Any, least: Any) -> None:
 def _raise(values: Any, most: Any) -> None:
     for i in range(len(values)):
         most[i] = max(most[i], values[i])
-
-
-@compiled
-def _change_any(known: Known, channels: Any, t: Any, n: Any, base: Any, work: Any) -> Any:
-    """A run from bounds before a step in which any of its events may change."""
-    _copy_state(base, work, n)
-    for source in range(channels):
-        work.listed[n + source] = source
-        work.kind[n + source] = -2 if known.events[source, t] else 2
-    return n + channels
-
-
-@compiled_and_cached
-def _bound(
-    chip: Chip,
-    known: Known,
-    bounds: Safe,
-    left: Any,
-    channels: Any,
-    decision: Any,
-    lag: Any,
-    base: Any,
-    work: Any,
-    lost: Any,
-) -> None:
-    for t in range(len(lost)):
-        n = _past(chip, known, t, t, base, work)
-        _watch(chip, known, bounds, t, base)
-        n = _change_any(known, channels, t, n, base, work)
-        _follow(chip, known, bounds, left, t, n, decision, lag, base, work, lost[t])
-
-
-@compiled_and_cached
-def _bound_after(
-    chip: Chip,
-    known: Known,
-    bounds: Safe,
-    left: Any,
-    channels: Any,
-    decision: Any,
-    lag: Any,
-    past: Any,
-    t: Any,
-    base: Any,
-    hull: Any,
-    work: Any,
-    lost: Any,
-) -> None:
-    if past.single:
-        n = _past(chip, known, t - past.steps, t - past.steps, base, work)
-        n = _hull(chip, known, t - past.steps, t, channels, n, base, work, hull)
-    else:
-        n = _past(chip, known, t - past.steps + 1, t, base, work)
-    _watch(chip, known, bounds, t, base)
-    m = _change_any(known, channels, t, n, base, work)
-    if not _follow(chip, known, bounds, left, t, m, decision, lag, base, work, lost[1]):
-        copy(lost[1].ravel(), lost[0].ravel())  # one event alone can do no more than all
-        return
-    for source in range(channels):
-        _copy_state(base, work, n)
-        work.listed[n] = source
-        work.kind[n] = -1 if known.events[source, t] else 1
-        _follow(chip, known, bounds, left, t, n + 1, decision, lag, base, work, lost[0])
