@@ -99,6 +99,7 @@ def test_certificates_of_several_events_hold_and_planted_errors_do_not(tmp_path)
     assert set(good["rule"].tolist()) <= {2, 3}
     assert good["unaltered"].max() >= 2
     assert np.all(np.diff(good["change_bounds"]) > 0)
+    assert set(good["pasts"][:, 1].tolist()) == {0, 1}
     code, said = checked(tmp_path, tmp_path / "net.loom", good)
     assert code == 0, said
     assert f"no {good['unaltered'][1]} events alter that" in said
@@ -116,6 +117,10 @@ def test_certificates_of_several_events_hold_and_planted_errors_do_not(tmp_path)
     fewer = {"changes": good["changes"][1:], "change_bounds": np.maximum(good["change_bounds"] - 1, 0)}
     assert "changes named" in planted(**fewer)
     assert "does not have" in planted(changes=good["changes"] * 0 + good["bins"].shape[0])
+    for wrong in ([0, 0, 5], [3, 1, 2], [1, 2, 5], [1, 0, 50], [1, 0, -1]):
+        assert "told apart" in planted(pasts=np.broadcast_to(wrong, good["pasts"].shape).astype(np.int64))
+    without = {"pasts": good["pasts"][:0], "past_bounds": good["past_bounds"] * 0}
+    assert "that no" in planted(**without)
     code, said = checked(tmp_path, tmp_path / "other.loom", good)
     assert code == 1
     assert "another netlist" in said
