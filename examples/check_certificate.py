@@ -259,8 +259,8 @@ def check(chip, events, bins, claim):
         require(counts.none_of(k, events, bins, decision), f"that no {k} events alter the decision")
     elif rule > 1:
         far, single, step = apart.T
-        told = (far > 0) & np.isin(single, (0, 1)) & (step >= far * single) & (step < bins.shape[1])
-        require(told.all(), "what is told apart of the past")
+        valid = (far > 0) & np.isin(single, (0, 1)) & (step >= far * single) & (step < bins.shape[1])
+        require(valid.all(), "what is told apart of the past")
         flips = flips[:, : bins.shape[1]]
         groups = beside("check_groups.py")["Groups"](chip, events, flips, decision, states, counts)
         none_alter = groups.none_of(k, apart if rule == 3 else apart[:0])

@@ -25,8 +25,8 @@ REACH = 12  # steps to the next group that are told apart
 def largest(most, keep):
     """Largest value of which at most `most` is kept."""
     k = np.maximum(keep, 1)
-    found = np.where(most >= 0, ((most + 1) * 4096 - 1) // k, -((-most * 4096 + k - 1) // k))
-    return np.clip(np.where(keep > 0, found, np.where(most >= 0, FAR, -FAR)), -FAR, FAR)
+    value = np.where(most >= 0, ((most + 1) * 4096 - 1) // k, -((-most * 4096 + k - 1) // k))
+    return np.clip(np.where(keep > 0, value, np.where(most >= 0, FAR, -FAR)), -FAR, FAR)
 
 
 def safe(chip, states):

@@ -48,9 +48,9 @@ def groups(chip: Chip, known: Known, shape: tuple[int, int, int], decision: int,
 
     def after(past: Past, step: int) -> AnyArray:
         require_below("step", np.array([step, step - past.steps * past.single]), steps)
-        found = np.full((2, reach, classes), -FAR, np.int32)
-        _bound_after(chip, known, bounds, left, channels, decision, lag, past, step, base, hull, work, found)
-        return found
+        most = np.full((2, reach, classes), -FAR, np.int32)
+        _bound_after(chip, known, bounds, left, channels, decision, lag, past, step, base, hull, work, most)
+        return most
 
     return Groups(lag, lost, after)
 
