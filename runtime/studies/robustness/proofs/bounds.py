@@ -58,17 +58,17 @@ def lower_bound(votes: IntArray, groups: Groups, pasts: tuple[Past, ...], most: 
     for other in np.argsort(gaps, kind="stable").tolist():
         if other == decision:
             continue
-        lost = np.broadcast_to(groups.lost[..., other], (len(pasts), 2, *groups.lost.shape[:2])).copy()
+        of_class = np.broadcast_to(groups.lost[..., other], (len(pasts), 2, *groups.lost.shape[:2])).copy()
         for (past, step), each in known.items():
-            lost[past, :, step] = each[..., other]
+            of_class[past, :, step] = each[..., other]
         while True:
-            events, chain = fewest(lost, follows, last, certified, gaps[other])
+            events, chain = fewest(of_class, follows, last, certified, gaps[other])
             unknown = {(past, step) for past, step in chain.tolist() if past} - known.keys()
             if not unknown:
                 break
             for past, step in sorted(unknown):
                 known[past, step] = groups.after(pasts[past], step)
-                lost[past, :, step] = known[past, step][..., other]
+                of_class[past, :, step] = known[past, step][..., other]
         certified = min(certified, events - 1)
     rests_on = [(*pasts[past], step) for past, step in sorted(known)]
     return Proven(certified, np.array(rests_on, np.int64).reshape(-1, 3))
