@@ -96,7 +96,8 @@ def depends(log: Path, place: Path) -> dict[str, str]:
 def run(name: str, place: Path, sources: list[Path]) -> dict[str, Any]:
     """Run what made a result in an empty folder, and give its record; it is in ``benchmarks/results`` there."""
     shutil.copytree(HERE, place / "benchmarks")
-    (place / "docs").symlink_to(ROOT / "docs")
+    for folder in ("docs", "tests"):
+        (place / folder).symlink_to(ROOT / folder)
     (place / "FOLDER").mkdir()
     for file in [file for folder in sources for file in folder.resolve().iterdir()]:
         for link in {file.name, f"FOLDER/{file.name}", file.name.removeprefix("Ev-").lower()}:

@@ -237,3 +237,38 @@ def test_weights_that_a_hook_computes_are_as_it_computes_them(change):
     change(dense)
     (projection,) = spikeloom.compile(module, example=torch.zeros(1, 6)).network.projections
     assert_allclose(projection.weight.toarray(), dense.weight.detach().numpy(), rtol=1e-6)
+
+
+class Computed(nn.Module):
+    """Keeps a tensor that is computed from a parameter."""
+
+    def __init__(self, keep):
+        super().__init__()
+        self.dense = nn.Linear(6, 4)
+        self.neurons = LIF(beta=0.5, theta=0.5)
+        keep(self, self.dense.weight * 2)
+
+    def forward(self, x):
+        self.twice += 0 * x.sum()
+        return self.neurons(nn.functional.linear(x, self.twice))
+
+
+KEPT = {
+    "an attribute": lambda module, value: setattr(module, "twice", value),
+    "a buffer": lambda module, value: module.register_buffer("twice", value),
+}
+
+
+@pytest.mark.parametrize("keep", KEPT.values(), ids=KEPT)
+def test_tensors_that_a_module_computed_are_copied(keep):
+    module = Computed(keep)
+    before = module.twice.detach().clone()
+    (projection,) = spikeloom.compile(module, example=torch.ones(1, 6)).network.projections
+    assert_allclose(projection.weight.toarray(), before.numpy(), rtol=1e-6)
+    assert torch.equal(module.twice, before)
+
+
+def test_a_module_that_cannot_be_copied_is_refused():
+    module = nn.Sequential(nn.Linear(6, 4), LIF(beta=0.5, theta=0.5))
+    module.kept = [module[0].weight * 2]
+    refused(ModelError, "cannot be copied", module_network, module, torch.zeros(1, 6))

@@ -95,7 +95,7 @@ def test_recordings_that_calibrate_are_not_reported_in_silence(said, refused, pl
 
 def test_recordings_that_chose_the_storage_are_not_verified_on_in_silence(said, place):
     said("compile net.pt --calibrate data/test -o chosen.loom")
-    told = "warning: test: these are the 9 recordings that chose the network's storage"
+    told = "warning: test: these are the 9 recordings that the network was compiled on"
     for words in (
         "run chosen.loom --data data/test",
         "verify chosen.loom --checkpoint net.pt --data data/test --min-agreement 0",
@@ -103,11 +103,11 @@ def test_recordings_that_chose_the_storage_are_not_verified_on_in_silence(said, 
     ):
         assert told in said(words)[1]
     said("compile net.pt --calibrate data -o right.loom")
-    assert "chose the network's storage" not in said("run right.loom --data data")[1]
-    told = "warning: test: these are 4 of the 9 recordings that chose the network's storage"
+    assert "the network was compiled on" not in said("run right.loom --data data")[1]
+    told = "warning: test: these are 4 of the 9 recordings that the network was compiled on"
     assert told in said("run chosen.loom --data data/test --limit 4")[1]
-    assert "chose the network's storage" not in said("run right.loom --data data --limit 4")[1]
-    told = "warning: train: these are the 9 recordings that chose the network's storage"
+    assert "the network was compiled on" not in said("run right.loom --data data --limit 4")[1]
+    told = "warning: train: these are the 9 recordings that the network was compiled on"
     said("lean free.pt --data data --bin 0.05 -o lean.loom")
     assert told in said("run lean.loom --data data/train")[1]
     assert read_netlist(place / "lean.loom").provenance["bin_s"] == BIN
@@ -129,7 +129,7 @@ def test_a_part_of_what_trained_the_network_is_not_reported_in_silence(said):
 
 
 def test_counters_that_fewer_bits_would_silence_are_said(said):
-    told = "of counters and sums round to zero, which decides otherwise"
+    told = "of counters and sums round to zero, so it may decide otherwise"
     assert told in said("compile counters.pt --weight-bits 4 -o out.loom")[1]
     assert told not in said("compile counters.pt --weight-bits 8 -o out.loom")[1]
 
@@ -289,7 +289,7 @@ def test_no_polarities_are_refused(refused, said):
     told = "--polarities 0: allowed are numbers from 1"
     assert refused("compile flat.nir --polarities 0 -o out.loom") == told
     for option in ("--polarities 1", "--polarities-first"):
-        told = f"{option}: the file states 2 polarities, a taxel's in a row; omit it"
+        told = f"{option}: the file says 2 polarities, taxel by taxel; omit it"
         assert refused(f"compile flat.nir {option} -o out.loom") == told
     said("compile flat.nir --polarities 2 --polarities-last -o out.loom")
 

@@ -55,7 +55,7 @@ def _require_fit(where: str, found: Checkpoint, beta: float | None, theta: float
         raise OptionError(f"--beta {beta:g}: {where} has a decay for each layer, {decays}; omit --beta")
     for name, value, held in (("beta", beta, found.beta), ("theta", theta, found.theta)):
         if name not in found.assumed and value not in (None, held):
-            raise OptionError(f"--{name} {value:g}: {where} was trained with {held:g}; omit --{name}")
+            raise OptionError(f"--{name} {value:g}: {where} was trained with {held}; omit --{name}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -37,13 +37,18 @@ class _Stages:
 
     def __init__(self, net: nn.Module, example: Tensor) -> None:
         reset(net)
-        computed = {
-            id(value): value.detach()
+        computed = {  # as pruning leaves, which no copy takes
+            id(value): value.detach().to(torch.float64, copy=True)
             for part in net.modules()
-            for value in vars(part).values()
-            if isinstance(value, Tensor) and not value.is_leaf  # as pruning leaves, which no copy takes
+            for value in (*vars(part).values(), *part.buffers(recurse=False))
+            if isinstance(value, Tensor) and not value.is_leaf
         }
-        self.net = copy.deepcopy(net, computed).double().eval().requires_grad_(False)
+        try:
+            self.net = copy.deepcopy(net, computed).double().eval().requires_grad_(False)
+        except RuntimeError as error:
+            raise ModelError(
+                f"module: cannot be copied ({error}); let it keep parameters and buffers, no computed tensors"
+            ) from None
         names = {id(module): name for name, module in self.net.named_modules() if isinstance(module, LIF)}
         self.order: list[LIF] = []
         self.currents: list[Tensor] = []

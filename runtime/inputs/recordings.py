@@ -33,6 +33,9 @@ from spikeloom.runtime.requests.choices import SplitChoice
 TEST = "test"
 """Split that is read unless another is asked for."""
 
+COMPARED = 1000
+"""Recordings of a split, at most, that are read to tell whether these are the first of what trained a network."""
+
 FEW_STEPS = 10
 """A recording of fewer was hardly meant."""
 
@@ -85,7 +88,7 @@ def recordings(
                 warn_of_missing(data, range(classes))
         elif labels_for is not None:
             (data,) = without_gaps(data)
-    _warn_of_training(data, trained, lambda: _unlimited(path, data, limit, bin_s, trained, taxels))
+    _warn_of_training(data, trained, lambda: _whole_split(path, data, limit, bin_s, trained, taxels))
     data = first_part(data, trained.get("window", WHOLE) if window is None else window)
     warn_of_steps(data.source, data.seconds, trained)
     warn_of_few(data, bins)
@@ -122,7 +125,7 @@ def _read(
     return data
 
 
-def _unlimited(
+def _whole_split(
     path: str | Recordings,
     data: Recordings,
     limit: int | None,
@@ -130,15 +133,15 @@ def _unlimited(
     trained: Mapping[str, Any],
     taxels: int | None,
 ) -> Recordings:
-    """All recordings of the split that `data` are the first of; `data` where the others cannot be read."""
+    """All recordings of the split that `data` are the first of; `data` where the others cannot be read, or are many."""
     if isinstance(path, Recordings):
         return path
     if limit is None or len(data) < limit or path == SYNTHETIC:
         return data
     with suppress(DataError):
-        return events.load_data(
-            path, data.split, bin_s=bin_s, default_bin_s=trained.get("bin_s"), taxels=taxels
-        )
+        options: dict[str, Any] = {"bin_s": bin_s, "default_bin_s": trained.get("bin_s"), "taxels": taxels}
+        first = events.load_data(path, data.split, limit=COMPARED, **options)
+        return data if len(first) == COMPARED else first
     return data
 
 
@@ -206,14 +209,14 @@ def warn_of_steps(source: str, seconds: float, trained: Mapping[str, Any]) -> No
 
 
 def _warn_of_training(
-    data: Recordings, trained: Mapping[str, Any], unlimited: Callable[[], Recordings]
+    data: Recordings, trained: Mapping[str, Any], whole_split: Callable[[], Recordings]
 ) -> None:
     """Say on stderr that what stands for new recordings is what trained the network, or the first of it."""
-    did = {"train_sha256": "trained the network", "calibrated_sha256": "chose the network's storage"}
+    did = {"train_sha256": "trained the network", "calibrated_sha256": "the network was compiled on"}
     known = {trained[name]: done for name, done in did.items() if name in trained}
     if data.split == "train" or not known:
         return
-    every = first_part(unlimited(), trained.get("window", WHOLE))
+    every = first_part(whole_split(), trained.get("window", WHOLE))
     if (done := known.get(every.events_sha256)) is not None:
         are = "are" if len(every) == len(data) else f"are {len(data)} of"
         tell(

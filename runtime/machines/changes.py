@@ -53,7 +53,7 @@ class Groups(NamedTuple):
     # until `lag` steps after the next, if nothing is known of the groups before it: by its step; and by how many steps
     # later the next one comes, from 1, the last of them standing for later ones and for none
     lost: npt.NDArray[np.int32]
-    # The same of a group of a step (2, reach, classes), one event or more, by what is known of the group before it
+    # The same of a step (2, reach, classes), of one event and of any number, given what is known of the group before
     after: Callable[[Past, int], npt.NDArray[np.int32]]
 
 

@@ -145,7 +145,7 @@ def _sensor(
     stated = said["polarities"]
     if stated is not None and ((polarities or stated) != stated or first):
         option = "--polarities-first" if first else f"--polarities {polarities}"
-        raise OptionError(f"{option}: the file states {stated} polarities, a taxel's in a row; omit it")
+        raise OptionError(f"{option}: the file says {stated} polarities, taxel by taxel; omit it")
     channels = stages.stated_steps(graph, "clocks") or 0
     if channels and (channels > MOST_CLOCKS or len(shape) > 1 or shape[0] <= channels):
         raise ModelError(f"has {channels} clocks in an input of shape {list(shape)}; {AGAIN}")

@@ -73,8 +73,8 @@ def _warn_of_lost(done: Compilation, loaded: LoadedNetwork, path: str) -> None:
     zeroed = sum(choice.zeroed for choice in done.choices)
     if zeroed and loaded.format == COUNTING.name:
         tell(
-            f"warning: {path}: {number(zeroed, 'weight')} of counters and sums round to zero, which decides otherwise; "
-            "omit --weight-bits, or train with it"
+            f"warning: {path}: {number(zeroed, 'weight')} of counters and sums round to zero, so it may decide "
+            "otherwise; compile it without --weight-bits, or train with it"
         )
 
 

@@ -37,8 +37,8 @@ from spikeloom.runtime.studies.robustness.results import (
 from spikeloom.runtime.studies.robustness.threads import in_threads
 
 EACH, ANY, NEAR, COUNTS = 1, 2, 3, 4
-"""Rules of a certificate: each single event was run; bounds of groups, whatever came before; by their distance, too;
-what counters make of other numbers of events."""
+"""Rules of a certificate: each single event was run; bounds of groups, whatever came before; by what is known of the
+group before; what counters make of other numbers of events."""
 
 PROBED = 64
 """Single events whose time tells that of all."""

@@ -150,10 +150,10 @@ def train_seeds(jobs: Sequence[Job], *, resume: bool) -> list[Finished]:
         try:
             if cluster() is not None:
                 progress(0, "training")
-            for place, found in side_by_side(waiting, run_job):
+            for done, (place, found) in enumerate(side_by_side(waiting, run_job), 1):
                 results[waiting[place]] = found
                 if cluster() is not None:  # here each has a bar of its own
-                    progress(sum(job in results for job in waiting), "training")
+                    progress(done, "training")
         except UnfinishedError as error:
             raise OptionError(f"{error}; go on with --resume, and with fewer --seeds") from error
         except KeyboardInterrupt as interrupt:

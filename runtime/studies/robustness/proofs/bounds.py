@@ -3,8 +3,9 @@
 Changed events come in groups, one a step. The votes from where a group can be seen until the next can be are
 lost to this group. How many they are at most, :class:`Groups` says, by what is known of the group before it:
 nothing more is assumed of the past. A dynamic program over steps, pasts and events finds the worst of all.
-Each vote is counted for one group; those before the first group can be seen are the known ones. What is known of
-the past is left out at first, and counted where a group of the worst of all needs it, until none does.
+Each vote is counted for one group; those before the first group can be seen are the known ones. At
+first nothing is assumed of any past. For the groups on the worst chain it is then worked out, until the chain has no
+other.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def lower_bound(votes: IntArray, groups: Groups, pasts: tuple[Past, ...], most: 
     assert pasts[0] == Past(1), "a group may follow another in the next step"
     decision, gaps = needed(votes)
     last = max(index for index, past in enumerate(pasts) if not past.single)
-    follows = np.array([[_known(pasts, r, single) for r in range(REACH)] for single in (True, False)])
+    follows = np.array([[_past_after(pasts, r, single) for r in range(REACH)] for single in (True, False)])
     known: dict[tuple[int, int], AnyArray] = {}
     certified = most
     for other in np.argsort(gaps, kind="stable").tolist():
@@ -74,7 +75,7 @@ def lower_bound(votes: IntArray, groups: Groups, pasts: tuple[Past, ...], most: 
     return Proven(certified, np.array(rests_on, np.int64).reshape(-1, 3))
 
 
-def _known(pasts: tuple[Past, ...], steps: int, single: bool) -> int:
+def _past_after(pasts: tuple[Past, ...], steps: int, single: bool) -> int:
     """Which of the pasts says most of a group so many steps ago."""
     exact = Past(steps, single=True)
     if single and exact in pasts:

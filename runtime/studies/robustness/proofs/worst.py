@@ -33,8 +33,8 @@ def _leave(
 
 
 @compiled
-def _way(came: Any, late: Any, steps: Any, n: Any) -> Any:
-    """What is known of the past of each group of the worst chain of `n` events, and its step, last one first."""
+def _chain(came: Any, late: Any, steps: Any, n: Any) -> Any:
+    """The worst chain of `n` events, last group first."""
     chain = np.zeros((n, 2), np.int64)
     entry = late[steps, n, 1]
     count = 0
@@ -56,8 +56,10 @@ def fewest(lost: Any, follows: Any, last: int, most: int, gap: int) -> Any:
 
     `lost` (pasts, 2, steps, reach) are the votes of one class, see :class:`machines.changes.Groups`, `follows` (2,
     reach) what is known of a group by the events of the one before it and its distance, `last` if that is farther.
-    A way is what is known of the past of each group and its step. `enter` holds the most votes turned where a group is
-    at a step, its own not counted yet; `came` the group before it; `late` both where that is as far away as any.
+    A group is of one event, or of any number, which counts as two. A chain is what is known of the past of each group,
+    and its step. Groups are numbered 2 * (step * pasts + past) + events - 1. `enter` holds the most votes turned where
+    a group is at a step, its own not counted yet; `came` the number of the group before it, -1 for none; `late` both
+    where that is as far away as any.
     """
     pasts, _, steps, _ = lost.shape
     enter = np.full((steps, pasts, most + 1), NEVER)
@@ -82,5 +84,5 @@ def fewest(lost: Any, follows: Any, last: int, most: int, gap: int) -> Any:
                         _leave(enter, came, late, ours, follows[events - 1], votes, entry, t, n + events)
     for n in range(1, most + 1):
         if late[steps, n, 0] >= gap:
-            return n, _way(came, late, steps, n)
+            return n, _chain(came, late, steps, n)
     return most + 1, np.zeros((0, 2), np.int64)
