@@ -35,8 +35,11 @@ def float_model(file: str, netlist: Any) -> tuple[Simulation, Readout]:
     return float_simulation(network, np.float32), network.readout
 
 
-def row(machine: Any, model: Simulation, readout: Readout, events: Any) -> dict[str, int]:
-    """How many single events there are; how many alter a decision, on each side; and with how many the sides differ."""
+def row(machine: Any, model: Simulation, readout: Readout, events: Any, label: int) -> dict[str, int]:
+    """How many single events there are; how many alter a decision, on each side; and with how many the sides differ.
+
+    `right` is the float model's decision without any.
+    """
     netlist = machine.netlist
     channels = channels_of(events[None], netlist)[0]
     cells = cells_of(events, netlist)
@@ -52,6 +55,7 @@ def row(machine: Any, model: Simulation, readout: Readout, events: Any) -> dict[
     by_model = (by_running(votes, channels, changes).votes + of_model).argmax(axis=1)
     by_chip = (machine.effects(channels, changes).votes + of_chip).argmax(axis=1)
     return {
+        "right": int(of_model.argmax() == label),
         "changes": len(by_chip),
         "alike_unchanged": int(of_model.argmax() == of_chip.argmax()),
         "differ": int(np.count_nonzero(by_model != by_chip)),
@@ -76,7 +80,9 @@ if __name__ == "__main__":
     for index in range(arguments.every - 1, len(test), arguments.every):
         events = test.events[index, ..., : test.steps_of(index)]
         each.setdefault(test.files[index], None)
-        each[test.files[index]] = each[test.files[index]] or row(machine, model, readout, events)
+        each[test.files[index]] = each[test.files[index]] or row(
+            machine, model, readout, events, int(test.labels[index])
+        )
         sums = {key: sum(one[key] for one in each.values()) for key in next(iter(each.values()))}
         alike = sum(one["alike_unchanged"] and not one["differ"] for one in each.values())
         found = {"recordings": len(each), "alike_for_every_event": alike, "together": sums, "each": each}

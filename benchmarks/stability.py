@@ -1,9 +1,10 @@
-"""What ``spikeloom certify`` found on networks, in short; and quick runs held against whole ones.
+"""Decisions that no small change alters, by ``spikeloom certify``, in short; and quick runs held against whole ones.
 
-    python benchmarks/stability.py DATA OUT.json --verdicts 'released=objects-verdicts.json' … [--brute objects.loom]
+    python benchmarks/stability.py DATA OUT.json [--picture OUT.png] [--brute]
 
-`--verdicts` are what ``certify -o`` wrote; `--brute` runs every single event changed of the first three recordings from
-the first step to the last, and counts where the quick runs differ.
+`--picture` draws how many decisions of the first network depend on each taxel; `--brute` runs every single event
+changed of its first three recordings from the first step to the last, and counts where the quick runs differ. Files are
+read from the folder in which it runs.
 """
 
 from __future__ import annotations
@@ -11,12 +12,15 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
+import tempfile
 import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from figures import Session
 from made import made
+from PIL import Image
 
 from spikeloom.models.recordings.events import load_data
 from spikeloom.runtime.machines.backends import machine_for
@@ -30,27 +34,51 @@ from spikeloom.runtime.studies.robustness.results import PHASES, Certificates
 Json = dict[str, Any]
 
 
+NETWORKS = {  # Command that makes each
+    "Ev-Objects.zip": {
+        "released": "compile objects_manual.t7 --graph manual --calibrate Ev-Objects.zip",
+        "counters": "compile pretrained:objects-counters",
+    },
+    "Ev-Containers.zip": {
+        "shipped": "compile pretrained:containers",
+        "counters": "compile pretrained:containers-counters",
+    },
+}
+
+
 def main() -> None:
-    """Read verdicts, run, write."""
+    """Compile, certify, write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("recordings")
+    parser.add_argument("recordings", choices=NETWORKS)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--verdicts", nargs="+", default=[], metavar="NAME=FILE")
-    parser.add_argument("--brute", metavar="FILE")
+    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--brute", action="store_true")
     arguments = parser.parse_args()
-    test = load_data(arguments.recordings, "test")
-    found: Json = made(load_data(arguments.recordings, "train"), test) | {
-        "data": Path(arguments.recordings).name
-    }
-    results = {}
-    for each in arguments.verdicts:
-        name, _, file = each.partition("=")
-        results[name] = read_json(Certificates, Path(file), "--verdicts", "spikeloom certify -o")
+    data = arguments.recordings
+    test = load_data(data, "test")
+    found: Json = made(load_data(data, "train"), test) | {"data": data}
+    with tempfile.TemporaryDirectory() as folder:
+        session = Session(Path.cwd(), Path(folder))
+        results = {}
+        for name, words in NETWORKS[data].items():
+            first = not results
+            session.run(f"{words} -o {name}.loom")
+            results[name] = verdicts(session, name, data, "--picture taxels.png" if first else "")
+            if first and arguments.picture:
+                drawn = Image.open(session.folder / "taxels.png")
+                drawn.convert("RGB").quantize(128).save(arguments.picture, optimize=True)
+            if first and arguments.brute:
+                found["brute_force"] = brute_force(str(session.folder / f"{name}.loom"), test)
+    found["commands"] = session.commands
     found["networks"] = {name: summary(result) for name, result in results.items()}
     found["fall"] = {kind: fallen(list(results.values()), kind) for kind in EXHAUSTIVE}
-    if arguments.brute:
-        found["brute_force"] = brute_force(arguments.brute, test)
     arguments.output.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def verdicts(session: Session, name: str, data: str, options: str = "") -> Certificates:
+    """What ``certify`` says of a netlist in the folder of a session."""
+    session.run(f"certify {name}.loom --data {data} {options}".rstrip() + f" -o {name}.json")
+    return read_json(Certificates, session.folder / f"{name}.json", "certify", "spikeloom certify -o")
 
 
 def fallen(results: list[Certificates], kind: str) -> Json:
