@@ -11,6 +11,7 @@ FOLDER holds ``Ev-Objects.zip``, ``Ev-Containers.zip``, ``ntp-textures.zip`` and
 import argparse
 import json
 import tempfile
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -99,18 +100,21 @@ def certified(session: Session, data: str, commands: list[str]) -> dict[str, Any
 
 def draw(found: dict[str, Any], file: Path) -> None:
     """Share of all recordings over the number of events."""
-    figure, panels = plt.subplots(1, len(found), figsize=(10, 2.9), layout="constrained")
+    figure, panels = plt.subplots(1, len(found), figsize=(10, 2.9), sharey=True, layout="constrained")
+    colours = {
+        name: f"C{index}" for index, name in enumerate(dict.fromkeys(chain.from_iterable(found.values())))
+    }
     for panel, (data, networks) in zip(panels, found.items(), strict=True):
         recordings = max(network.get("recordings", 0) for network in networks.values())
         for name, network in networks.items():
             shares = [100 * count / recordings for count in network["right"]]
-            panel.plot(range(len(shares)), shares, "o-", ms=4, lw=1.4, label=name)
+            panel.plot(range(len(shares)), shares, "o-", ms=4, lw=1.4, color=colours[name], label=name)
         title = data.removeprefix("Ev-").removesuffix(".zip").capitalize()
         panel.set(title=title, xlabel="events added or removed, at most", xticks=range(MOST + 1))
         panel.grid(color="#ddd", lw=0.6)
         panel.spines[["top", "right"]].set_visible(False)
         panel.legend(frameon=False, fontsize=7)
-    panels[0].set_ylabel("right and proven to stay so, %")
+    panels[0].set(ylabel="right and proven to stay so, %", ylim=(0, 100))
     figure.savefig(file, dpi=80)
     Image.open(file).quantize(32).save(file, optimize=True)
 

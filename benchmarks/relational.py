@@ -85,7 +85,14 @@ if __name__ == "__main__":
         )
         sums = {key: sum(one[key] for one in each.values()) for key in next(iter(each.values()))}
         alike = sum(one["alike_unchanged"] and not one["differ"] for one in each.values())
-        found = {"recordings": len(each), "alike_for_every_event": alike, "together": sums, "each": each}
+        unaltered = sum(not one["alter_model"] for one in each.values())
+        found = {
+            "recordings": len(each),
+            "alike_for_every_event": alike,
+            "unaltered_model": unaltered,
+            "together": sums,
+            "each": each,
+        }
         output.write_text(
             json.dumps(made(load_data(arguments.recordings, "train"), test) | found, indent=1) + "\n"
         )
