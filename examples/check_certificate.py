@@ -86,12 +86,17 @@ class Chip:
         return ends
 
     def votes(self, fired):
-        """Votes by class of spikes (rows, neurons)."""
-        return np.stack([fired[:, self.label == each].sum(axis=1) for each in range(self.classes)], axis=1)
+        """Votes by class of spikes (rows, neurons), or (rows, last neurons)."""
+        label = self.label[self.neurons - fired.shape[1] :]
+        return np.stack([fired[:, label == each].sum(axis=1) for each in range(self.classes)], axis=1)
 
 
 class Loihi(Chip):
-    """State: least and largest current, the same of the membrane, and who spiked surely, and may have."""
+    """State: least and largest current, the same of the membrane, and who spiked surely, and may have.
+
+    Neurons are in the order of their layers. Registers are whole numbers in float64, which holds them exactly, as it
+    does their products with what is kept: these are below 2 ** 36.
+    """
 
     bin_ticks = 1
 
@@ -103,10 +108,15 @@ class Loihi(Chip):
         target = a["core_compartments"][parts(a["core_axons"])][axon] + a["synapse_target"]
         self.channels = about["taxels"] * about["polarities"] + about["clocks"]["channels"]
         source, n = a["axon_source"][axon], len(a["layer"])
+        depth = np.array([layer["depth"] for layer in about["layers"]])[a["layer"]]
+        order = np.argsort(depth, kind="stable")
+        place = np.append(np.arange(self.channels), self.channels + np.argsort(order))  # of sources
+        source, target = place[source], np.argsort(order)[target]
+        a = {name: each[order] for name, each in a.items() if len(each) == n}
         self.connect(source, target, weight, self.channels + n, a["readout_class"], about["classes"])
         self.keep_u, self.keep_v = 4095 - a["decay_u"], 4096 - a["decay_v"]
         self.threshold, self.bias = a["threshold"] << 6, a["bias_mantissa"] << a["bias_exponent"]
-        self.depth = np.array([layer["depth"] for layer in about["layers"]])[a["layer"]]
+        self.depth = depth[order]
         self.drain = int(self.depth.max())
         up, down = (64 * np.bincount(target, (s * weight).clip(0), n).astype(np.int64) for s in (1, -1))
         # least and most currents, whatever the input
@@ -117,21 +127,41 @@ class Loihi(Chip):
     def start(self, steps):
         """At rest, for a recording of so many steps."""
         self.steps = steps
-        return [*np.zeros((4, 1, self.neurons), np.int64), *np.zeros((2, 1, self.neurons), np.bool_)]
+        return [*np.zeros((4, 1, self.neurons)), *np.zeros((2, 1, self.neurons), np.bool_)]
 
     def tick(self, state, seen, t):
         """Bounds of all rows a step on, and the least and most votes; `seen` are the events, sure and possible."""
-        box, fired = list(state[:4]), state[4:]
-        inside = (self.depth <= t) & (t < self.depth + self.steps)
-        sums = self.sums(*(np.concatenate(each, axis=1) for each in zip(seen, fired, strict=True)))
-        for end in (0, 1):
-            u = np.clip(decayed(box[end], self.keep_u) + 64 * sums[end], -LIMIT, LIMIT) * inside
-            v = decayed(box[2 + end], self.keep_v) + u + self.bias
-            box[end], box[2 + end] = u, np.clip(v, -LIMIT, LIMIT) * inside
-        sure, may = box[2] > self.threshold, box[3] > self.threshold
-        box[2] = np.where(sure, 0, np.where(may, np.minimum(box[2], 0), box[2]))
-        box[3] = np.where(sure, 0, np.where(may, self.threshold, box[3]))
-        return [*box, sure, may], (self.votes(sure), self.votes(may))
+        sums = self.sums(*(np.concatenate(each, axis=1) for each in zip(seen, state[4:], strict=True)))
+        state = self.after(state, sums, t)
+        return state, (self.votes(state[4]), self.votes(state[5]))
+
+    def after(self, state, sums, t):
+        """Bounds a step on, by bounds of what synapses add up to; of all neurons, or of the last ones.
+
+        The registers of `state` are changed in place.
+        """
+        those = slice(self.neurons - state[0].shape[1], None)
+        threshold, outside = self.threshold[those], (t < self.depth[those]) | (
+            self.depth[those] + self.steps <= t
+        )
+        for u, v, total in zip(state[:2], state[2:4], sums, strict=True):
+            u *= self.keep_u[those] / 4096
+            np.trunc(u, out=u)
+            u += 64 * total
+            u[:, outside] = 0
+            v *= self.keep_v[those] / 4096
+            np.trunc(v, out=v)
+            v += u
+            v += self.bias[those]
+            np.clip(v, -LIMIT, LIMIT, out=v)
+            v[:, outside] = 0
+        low, high = state[2:4]
+        sure, may = low > threshold, high > threshold
+        np.minimum(low, 0, out=low, where=may)
+        np.copyto(low, 0, where=sure)
+        np.copyto(high, threshold, where=may)
+        np.copyto(high, 0, where=sure)
+        return [*state[:4], sure, may]
 
     def lowest(self, steps):
         """Membranes below which none is within so many steps, whatever the input."""
@@ -144,8 +174,9 @@ class Loihi(Chip):
     def unknown(self, begin, least):
         """Whatever any input can have brought about before a step."""
         inside = ((self.depth < begin) & (begin <= self.depth + self.steps))[None]
-        u = [each * (self.keep_u > 0) * inside for each in self.most]
-        return [*u, least * inside, self.threshold * inside, inside & False, inside]
+        u = [each * (self.keep_u > 0) for each in self.most]
+        box = [each * inside.astype(np.float64) for each in (*u, least, self.threshold)]
+        return [*box, inside & False, inside]
 
 
 class TrueNorth(Chip):
@@ -230,7 +261,7 @@ def run(chip, events, flips, decision):
         np.maximum.at(worst, of, ahead)
         worst[0] = ahead[0]
         state, ahead = [each[kept] for each in state], worst
-        states.append([each[:1] for each in state])
+        states.append([each[:1].copy() for each in state])
         counts.append(votes[0])
     wins = np.maximum(ahead.max(axis=0), ahead[0] + over) >= 1 * (np.arange(chip.classes) > decision)
     return states, np.array(counts), bool(np.delete(wins, decision).any())

@@ -33,7 +33,7 @@ def safe(chip, states):
     """Least and largest membrane before each step from which, the events known, all spikes are the known ones."""
     ends = [(np.full(chip.neurons, -FAR), np.full(chip.neurons, FAR))]
     for t in reversed(range(len(states) - 1)):
-        more, fired = states[t + 1][0][0] + chip.bias, states[t + 1][4][0]
+        more, fired = states[t + 1][0][0].astype(np.int64) + chip.bias, states[t + 1][4][0]
         least = np.where(fired, chip.threshold + 1, ends[-1][0])
         most = np.where(fired, FAR, np.minimum(chip.threshold, ends[-1][1]))
         low = np.where(least <= -LIMIT, -FAR, -largest(more - least, chip.keep_v))
@@ -41,6 +41,23 @@ def safe(chip, states):
         inside = (chip.depth <= t) & (t < chip.depth + chip.steps)
         ends.append((np.where(inside, low, -FAR), np.where(inside, high, FAR)))
     return ends[::-1]
+
+
+class Layer:
+    """Neurons of one depth, the sources that feed them, and the weights between, above and below zero.
+
+    Products with these are exact in float32: a register that sums of 2 ** 15 and more could reach was refused.
+    """
+
+    def __init__(self, chip, depth):
+        first, last = np.searchsorted(chip.depth, [depth, depth + 1])
+        here = np.flatnonzero((first <= chip.target) & (chip.target < last))
+        source = np.searchsorted(chip.first, here, side="right") - 1
+        self.neurons, self.first = np.arange(first, last), first
+        self.sources, row = np.unique(source, return_inverse=True)
+        self.above, self.below = np.zeros((2, len(self.sources), last - first), np.float32)
+        for weights, end in ((self.above, np.maximum), (self.below, np.minimum)):
+            np.add.at(weights, (row, chip.target[here] - first), end(chip.weight[here], 0))
 
 
 class Groups:
@@ -54,11 +71,40 @@ class Groups:
         )  # by step, until all votes are counted
         self.events[: events.shape[1]] = events.T
         self.least = chip.lowest(len(counts))
+        self.layers = [Layer(chip, depth) for depth in range(chip.drain + 1)]
+        # spikes of all sources that reach each step, what they add up to, and where no later neuron feeds an earlier one
+        self.spikes = np.hstack([self.events, np.concatenate([each[4] for each in states[:-1]])])
+        self.sums = np.zeros((len(counts), chip.neurons), np.float32)
+        self.ends, last = [0], -1
+        for layer in self.layers:
+            weights = layer.above + layer.below
+            self.sums[:, layer.neurons] = self.spikes[:, layer.sources].astype(np.float32) @ weights
+            last = max(last, layer.sources.max(initial=-1))
+            if last < chip.channels + layer.first + len(layer.neurons):
+                self.ends.append(layer.first + len(layer.neurons))
         reached, self.lag = np.arange(chip.channels + chip.neurons) < chip.channels, -1
         while self.lag < len(counts) and not (chip.label[reached[chip.channels :]] >= 0).any():
             low, high = chip.sums(reached[None] & False, reached[None])
             reached[chip.channels :] |= (low[0] < 0) | (high[0] > 0)
             self.lag += 1
+
+    def step(self, state, seen, s):
+        """State a step on of all neurons, or of the last ones if the others spike as known; `seen` if channels do not."""
+        first = self.chip.neurons - state[0].shape[1]
+        begin = 0 if seen else self.chip.channels + first
+        fired = [np.hstack(each) for each in zip(seen, state[4:], strict=True)] if seen else state[4:]
+        # beyond those known
+        sure, may = (each.astype(np.float32) - self.spikes[s, begin:] for each in fired)
+        sums = np.empty((2, *state[0].shape), np.float32)
+        sums[:] = self.sums[s, first:]
+        for layer in self.layers:
+            if layer.first >= first:
+                k = np.searchsorted(layer.sources, begin)
+                above, below, source = layer.above[k:], layer.below[k:], layer.sources[k:] - begin
+                some, any_ = sure[:, source], may[:, source]
+                sums[0][:, layer.neurons - first] += some @ above + any_ @ below
+                sums[1][:, layer.neurons - first] += any_ @ above + some @ below
+        return self.chip.after(state, sums, s)
 
     def before(self, t, far, single):
         """Bounds of the state before step `t`; the last group was `far` steps ago at least, or a single event then."""
@@ -69,7 +115,7 @@ class Groups:
             state = [np.repeat(each, max(len(source), 1), axis=0) for each in state]
             now = np.repeat(self.events[[s]], len(state[0]), axis=0)
             now[np.arange(len(source)), source] ^= True
-            state, _ = self.chip.tick(state, (now, now), s)
+            state = self.step(state, (now, now), s)
         least, most = ([end(each, axis=0, keepdims=True) for each in state] for end in (np.min, np.max))
         return [least[0], most[1], least[2], most[3], least[4], most[5]]
 
@@ -78,32 +124,44 @@ class Groups:
 
         The group is of step `t`, the one before it as in ``before``. By (one event or more, reach, classes).
         """
-        chip, source = self.chip, np.flatnonzero(self.flips[:, t])
-        rows = 1 if far == 1 and not single else 1 + len(source)
-        state = [np.repeat(each, rows, axis=0) for each in self.before(t, far, single)]
+        state, source = self.before(t, far, single), np.flatnonzero(self.flips[:, t])
+        sure, may = self.events[[t]], self.events[[t]]
+        sure[:, source], may[:, source] = False, True
+        more = self.follow(state, (sure, may), t)[0]
+        if far == 1 and not single:
+            return np.stack([more, more])
+        one = np.repeat(self.events[[t]], len(source), axis=0)
+        one[np.arange(len(source)), source] ^= True
+        return np.stack([self.follow(state, (one, one), t).max(axis=0), more])
+
+    def follow(self, state, seen, t):
+        """The same (rows, reach, classes) from a state before step `t`, by events of that step (rows, channels)."""
+        chip, rows = self.chip, len(seen[0])
+        state = [np.repeat(each, rows, axis=0) for each in state]
         table, lost = np.zeros((rows, REACH, chip.classes), int), np.zeros((rows, chip.classes), int)
-        left = np.arange(rows)  # that are not over yet
+        left, first = np.arange(rows), 0  # rows that are not over, neurons before which all are
         for s in range(t, len(self.counts)):
-            sure, may = (np.repeat(self.events[[s]], len(left), axis=0) for _ in range(2))
-            if s == t:
-                sure[0, source], may[0, source] = False, True
-                for k in range(1, rows):
-                    sure[k, source[k - 1]] = may[k, source[k - 1]] = not self.events[s, source[k - 1]]
-            state, (fewest, most) = chip.tick(state, (sure, may), s)
+            state = self.step(state, seen, s)
+            known, safe = ([each[..., first:] for each in all_[s + 1]] for all_ in (self.states, self.safe))
             r = s + 1 - t - self.lag
             if r > 0:
-                known = self.counts[s]
-                lost = lost + (known[self.decision] - fewest[:, [self.decision]]) + most - known
+                fewest, most, votes = (chip.votes(each) for each in (state[4], state[5], known[4]))
+                ours = (votes - fewest)[:, [self.decision]]
+                lost = lost + ours + most - votes
                 before = table[left, -1:] if r >= REACH else -FAR
                 table[left, min(r, REACH) - 1 :] = np.maximum(lost[:, None], before)
-            known, (low, high) = self.states[s + 1], self.safe[s + 1]
-            over = (state[2] >= low) & (state[3] <= high) & (state[4] == known[4]) & (state[5] == known[5])
-            over &= (chip.keep_u == 0) | ((state[0] == known[0]) & (state[1] == known[1]))
+            over = (state[2] >= safe[0]) & (state[3] <= safe[1])
+            over &= (state[4] == known[4]) & (state[5] == known[5])
+            over &= (chip.keep_u[first:] == 0) | ((state[0] == known[0]) & (state[1] == known[1]))
             goes_on = ~over.all(axis=1)
-            state, left, lost = [each[goes_on] for each in state], left[goes_on], lost[goes_on]
-            if not len(left):
+            if not goes_on.any():
                 break
-        return table[[0, 0]] if rows == 1 else np.stack([table[1:].max(axis=0), table[0]])
+            all_over = first + over.all(axis=0).argmin()
+            end = max(each for each in self.ends if each <= all_over)
+            seen = [np.repeat(self.events[[s + 1]], goes_on.sum(), axis=0)] * 2 if not end and s + 1 < len(self.counts) else []
+            state = [each[goes_on, end - first :] for each in state]
+            left, lost, first = left[goes_on], lost[goes_on], end
+        return table
 
     def none_of(self, k, apart):
         """Whether no `k` events alter the decision; `apart` (rows, 3) says what is told apart, and in which step."""
