@@ -88,7 +88,9 @@ class Chip:
     def votes(self, fired):
         """Votes by class of spikes (rows, neurons), or (rows, last neurons)."""
         label = self.label[self.neurons - fired.shape[1] :]
-        return np.stack([fired[:, label == each].sum(axis=1) for each in range(self.classes)], axis=1)
+        voters = np.flatnonzero(label >= 0)
+        ballots = label[voters, None] == np.arange(self.classes)
+        return (fired[:, voters] @ ballots.astype(np.float64)).astype(np.int64)
 
 
 class Loihi(Chip):
@@ -136,18 +138,18 @@ class Loihi(Chip):
         return state, (self.votes(state[4]), self.votes(state[5]))
 
     def after(self, state, sums, t):
-        """Bounds a step on, by bounds of what synapses add up to; of all neurons, or of the last ones.
+        """Bounds a step on of all neurons, or of the last ones, by the least and largest sums of their synapses.
 
-        The registers of `state` are changed in place.
+        `state` is overwritten: new memory for each number would take longer than to find the number.
         """
         those = slice(self.neurons - state[0].shape[1], None)
-        threshold, outside = self.threshold[those], (t < self.depth[those]) | (
-            self.depth[those] + self.steps <= t
-        )
-        for u, v, total in zip(state[:2], state[2:4], sums, strict=True):
+        threshold, depth = self.threshold[those], self.depth[those]
+        outside = (t < depth) | (depth + self.steps <= t)
+        for end in (0, 1):
+            u, v = state[end], state[2 + end]
             u *= self.keep_u[those] / 4096
             np.trunc(u, out=u)
-            u += 64 * total
+            u += 64 * sums[end]
             u[:, outside] = 0
             v *= self.keep_v[those] / 4096
             np.trunc(v, out=v)

@@ -6,7 +6,8 @@ group after i. ``turned`` bounds how many of these can turn by interval arithmet
 can bring about (``before``), through the known events between the groups, the group (its one change, or any), and
 known events again. Decay, sums, saturation and comparison are monotone, and a reset leaves zero or what is below the
 threshold, so no run leaves its bounds. They are followed until every membrane is where known events make every spike
-the known one for ever (``safe``: an interval, found backwards).
+the known one for ever (``safe``: an interval, found backwards). That ends a layer too, with those before it, if none
+after it feeds them.
 
 Of the group before one is known that it was at least so many steps ago, or that it was one event exactly so many steps
 ago: then bounds are the widest of runs with each event of that step. ``none_of`` adds the worst of all steps, distances
@@ -44,20 +45,20 @@ def safe(chip, states):
 
 
 class Layer:
-    """Neurons of one depth, the sources that feed them, and the weights between, above and below zero.
+    """Neurons `first` to before `end`, the sources that feed them, and weights between them above and below zero.
 
-    Products with these are exact in float32: a register that sums of 2 ** 15 and more could reach was refused.
+    Products with these are exact in float32: of neither are there 2 ** 15 to a neuron, or the chip were refused.
     """
 
     def __init__(self, chip, depth):
-        first, last = np.searchsorted(chip.depth, [depth, depth + 1])
-        here = np.flatnonzero((first <= chip.target) & (chip.target < last))
-        source = np.searchsorted(chip.first, here, side="right") - 1
-        self.neurons, self.first = np.arange(first, last), first
+        self.first, self.end = np.searchsorted(chip.depth, [depth, depth + 1])
+        synapse = np.flatnonzero((self.first <= chip.target) & (chip.target < self.end))
+        source = np.searchsorted(chip.first, synapse, side="right") - 1
         self.sources, row = np.unique(source, return_inverse=True)
-        self.above, self.below = np.zeros((2, len(self.sources), last - first), np.float32)
-        for weights, end in ((self.above, np.maximum), (self.below, np.minimum)):
-            np.add.at(weights, (row, chip.target[here] - first), end(chip.weight[here], 0))
+        at, weight = (row, chip.target[synapse] - self.first), chip.weight[synapse]
+        self.above, self.below = np.zeros((2, len(self.sources), self.end - self.first), np.float32)
+        np.add.at(self.above, at, np.maximum(weight, 0))
+        np.add.at(self.below, at, np.minimum(weight, 0))
 
 
 class Groups:
@@ -72,50 +73,59 @@ class Groups:
         self.events[: events.shape[1]] = events.T
         self.least = chip.lowest(len(counts))
         self.layers = [Layer(chip, depth) for depth in range(chip.drain + 1)]
-        # spikes of all sources that reach each step, what they add up to, and where no later neuron feeds an earlier one
+        # known spikes of all sources that reach neurons in each step, and what they add up to
         self.spikes = np.hstack([self.events, np.concatenate([each[4] for each in states[:-1]])])
         self.sums = np.zeros((len(counts), chip.neurons), np.float32)
-        self.ends, last = [0], -1
+        self.ends, last = [0], -1  # neurons up to which none is fed by later ones
         for layer in self.layers:
-            weights = layer.above + layer.below
-            self.sums[:, layer.neurons] = self.spikes[:, layer.sources].astype(np.float32) @ weights
+            spikes = self.spikes[:, layer.sources].astype(np.float32)
+            self.sums[:, layer.first : layer.end] = spikes @ (layer.above + layer.below)
             last = max(last, layer.sources.max(initial=-1))
-            if last < chip.channels + layer.first + len(layer.neurons):
-                self.ends.append(layer.first + len(layer.neurons))
+            if last < chip.channels + layer.end:
+                self.ends.append(layer.end)
         reached, self.lag = np.arange(chip.channels + chip.neurons) < chip.channels, -1
         while self.lag < len(counts) and not (chip.label[reached[chip.channels :]] >= 0).any():
             low, high = chip.sums(reached[None] & False, reached[None])
             reached[chip.channels :] |= (low[0] < 0) | (high[0] > 0)
             self.lag += 1
 
-    def step(self, state, seen, s):
-        """State a step on of all neurons, or of the last ones if the others spike as known; `seen` if channels do not."""
+    def changed(self, t):
+        """Events of a step when one of them is changed, each in turn: (changes, channels)."""
+        source = np.flatnonzero(self.flips[:, t])
+        events = np.repeat(self.events[[t]], len(source), axis=0)
+        events[np.arange(len(source)), source] ^= True
+        return events
+
+    def step(self, state, t, seen=None):
+        """Bounds a step on of all neurons, or of the last ones, where all others spike as known.
+
+        `seen` are the events, sure and possible, where they are not the known ones. `state` is overwritten.
+        """
         first = self.chip.neurons - state[0].shape[1]
-        begin = 0 if seen else self.chip.channels + first
-        fired = [np.hstack(each) for each in zip(seen, state[4:], strict=True)] if seen else state[4:]
-        # beyond those known
-        sure, may = (each.astype(np.float32) - self.spikes[s, begin:] for each in fired)
-        sums = np.empty((2, *state[0].shape), np.float32)
-        sums[:] = self.sums[s, first:]
+        fired, begin = state[4:], self.chip.channels + first  # of sources from this one on
+        if seen:
+            fired, begin = [np.hstack(each) for each in zip(seen, fired, strict=True)], 0
+        sure, may = (each - self.spikes[t, begin:].astype(np.float32) for each in fired)  # beyond the known
+        low, high = (np.repeat(self.sums[[t], first:], len(sure), axis=0) for _ in range(2))
         for layer in self.layers:
             if layer.first >= first:
                 k = np.searchsorted(layer.sources, begin)
                 above, below, source = layer.above[k:], layer.below[k:], layer.sources[k:] - begin
-                some, any_ = sure[:, source], may[:, source]
-                sums[0][:, layer.neurons - first] += some @ above + any_ @ below
-                sums[1][:, layer.neurons - first] += any_ @ above + some @ below
-        return self.chip.after(state, sums, s)
+                neurons = slice(layer.first - first, layer.end - first)
+                low[:, neurons] += sure[:, source] @ above + may[:, source] @ below
+                high[:, neurons] += may[:, source] @ above + sure[:, source] @ below
+        return self.chip.after(state, (low, high), t)
 
     def before(self, t, far, single):
         """Bounds of the state before step `t`; the last group was `far` steps ago at least, or a single event then."""
         begin = max(t - far + (not single), 0)
-        state = self.chip.unknown(begin, self.least) if begin else self.states[0]
-        for s in range(begin, t):
-            source = np.flatnonzero(self.flips[:, s]) if single and s == begin else np.zeros(0, int)
-            state = [np.repeat(each, max(len(source), 1), axis=0) for each in state]
-            now = np.repeat(self.events[[s]], len(state[0]), axis=0)
-            now[np.arange(len(source)), source] ^= True
-            state = self.step(state, (now, now), s)
+        state = self.chip.unknown(begin, self.least) if begin else [each.copy() for each in self.states[0]]
+        if single:
+            seen = self.changed(begin)
+            state = [np.repeat(each, len(seen), axis=0) for each in state]
+            state = self.step(state, begin, (seen, seen))
+        for s in range(begin + single, t):
+            state = self.step(state, s)
         least, most = ([end(each, axis=0, keepdims=True) for each in state] for end in (np.min, np.max))
         return [least[0], most[1], least[2], most[3], least[4], most[5]]
 
@@ -124,41 +134,38 @@ class Groups:
 
         The group is of step `t`, the one before it as in ``before``. By (one event or more, reach, classes).
         """
-        state, source = self.before(t, far, single), np.flatnonzero(self.flips[:, t])
-        sure, may = self.events[[t]], self.events[[t]]
-        sure[:, source], may[:, source] = False, True
-        more = self.follow(state, (sure, may), t)[0]
+        state, flips = self.before(t, far, single), self.flips[:, t]
+        most = self.follow(state, t, (self.events[[t]] & ~flips, self.events[[t]] | flips))[0]
         if far == 1 and not single:
-            return np.stack([more, more])
-        one = np.repeat(self.events[[t]], len(source), axis=0)
-        one[np.arange(len(source)), source] ^= True
-        return np.stack([self.follow(state, (one, one), t).max(axis=0), more])
+            return np.stack([most, most])
+        one = self.changed(t)
+        return np.stack([self.follow(state, t, (one, one)).max(axis=0), most])
 
-    def follow(self, state, seen, t):
-        """The same (rows, reach, classes) from a state before step `t`, by events of that step (rows, channels)."""
+    def follow(self, state, t, seen):
+        """Those votes (rows, reach, classes) by the state before step `t`, and events in it, sure and possible."""
         chip, rows = self.chip, len(seen[0])
         state = [np.repeat(each, rows, axis=0) for each in state]
         table, lost = np.zeros((rows, REACH, chip.classes), int), np.zeros((rows, chip.classes), int)
-        left, first = np.arange(rows), 0  # rows that are not over, neurons before which all are
+        # rows that are not over yet, and the first neuron of those that are not in all of them
+        left, first = np.arange(rows), 0
         for s in range(t, len(self.counts)):
-            state = self.step(state, seen, s)
-            known, safe = ([each[..., first:] for each in all_[s + 1]] for all_ in (self.states, self.safe))
+            state = self.step(state, s, seen if s == t else None)
+            known, (low, high) = (
+                [each[..., first:] for each in of[s + 1]] for of in (self.states, self.safe)
+            )
             r = s + 1 - t - self.lag
             if r > 0:
                 fewest, most, votes = (chip.votes(each) for each in (state[4], state[5], known[4]))
-                ours = (votes - fewest)[:, [self.decision]]
-                lost = lost + ours + most - votes
+                lost = lost + (votes - fewest)[:, [self.decision]] + most - votes
                 before = table[left, -1:] if r >= REACH else -FAR
                 table[left, min(r, REACH) - 1 :] = np.maximum(lost[:, None], before)
-            over = (state[2] >= safe[0]) & (state[3] <= safe[1])
-            over &= (state[4] == known[4]) & (state[5] == known[5])
+            over = (state[2] >= low) & (state[3] <= high) & (state[4] == known[4]) & (state[5] == known[5])
             over &= (chip.keep_u[first:] == 0) | ((state[0] == known[0]) & (state[1] == known[1]))
             goes_on = ~over.all(axis=1)
             if not goes_on.any():
                 break
-            all_over = first + over.all(axis=0).argmin()
-            end = max(each for each in self.ends if each <= all_over)
-            seen = [np.repeat(self.events[[s + 1]], goes_on.sum(), axis=0)] * 2 if not end and s + 1 < len(self.counts) else []
+            # neurons that are over stay so if no others feed them
+            end = max(each for each in self.ends if over[:, : max(each - first, 0)].all())
             state = [each[goes_on, end - first :] for each in state]
             left, lost, first = left[goes_on], lost[goes_on], end
         return table
