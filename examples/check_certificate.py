@@ -112,12 +112,13 @@ class Loihi(Chip):
         source, n = a["axon_source"][axon], len(a["layer"])
         depth = np.array([layer["depth"] for layer in about["layers"]])[a["layer"]]
         order = np.argsort(depth, kind="stable")
-        place = np.append(np.arange(self.channels), self.channels + np.argsort(order))  # of sources
-        source, target = place[source], np.argsort(order)[target]
-        a = {name: each[order] for name, each in a.items() if len(each) == n}
-        self.connect(source, target, weight, self.channels + n, a["readout_class"], about["classes"])
-        self.keep_u, self.keep_v = 4095 - a["decay_u"], 4096 - a["decay_v"]
-        self.threshold, self.bias = a["threshold"] << 6, a["bias_mantissa"] << a["bias_exponent"]
+        place = np.argsort(order)
+        source = np.append(np.arange(self.channels), self.channels + place)[source]
+        target = place[target]
+        self.connect(source, target, weight, self.channels + n, a["readout_class"][order], about["classes"])
+        self.keep_u, self.keep_v = 4095 - a["decay_u"][order], 4096 - a["decay_v"][order]
+        self.threshold = a["threshold"][order] << 6
+        self.bias = (a["bias_mantissa"] << a["bias_exponent"])[order]
         self.depth = depth[order]
         self.drain = int(self.depth.max())
         up, down = (64 * np.bincount(target, (s * weight).clip(0), n).astype(np.int64) for s in (1, -1))

@@ -45,9 +45,9 @@ def safe(chip, states):
 
 
 class Layer:
-    """Neurons `first` to before `end`, the sources that feed them, and weights between them above and below zero.
+    """Neurons from `first` to before `end`, sources that feed them, and the weights above and below zero, apart.
 
-    Products with these are exact in float32: of neither are there 2 ** 15 to a neuron, or the chip were refused.
+    Either of these add up to less than 2 ** 15 at a neuron, or ``Loihi`` refuses it: products are exact in float32.
     """
 
     def __init__(self, chip, depth):
@@ -97,23 +97,23 @@ class Groups:
         return events
 
     def step(self, state, t, seen=None):
-        """Bounds a step on of all neurons, or of the last ones, where all others spike as known.
+        """Bounds a step on of all neurons, or of the last ones where the others spike as known; `state` is overwritten.
 
-        `seen` are the events, sure and possible, where they are not the known ones. `state` is overwritten.
+        `seen` are the events (rows, channels), sure and possible, if they are not the known ones.
         """
         first = self.chip.neurons - state[0].shape[1]
         fired, begin = state[4:], self.chip.channels + first  # of sources from this one on
         if seen:
             fired, begin = [np.hstack(each) for each in zip(seen, fired, strict=True)], 0
-        sure, may = (each - self.spikes[t, begin:].astype(np.float32) for each in fired)  # beyond the known
+        sure, may = (each - self.spikes[t, begin:].astype(np.float32) for each in fired)  # not as known
         low, high = (np.repeat(self.sums[[t], first:], len(sure), axis=0) for _ in range(2))
         for layer in self.layers:
             if layer.first >= first:
                 k = np.searchsorted(layer.sources, begin)
                 above, below, source = layer.above[k:], layer.below[k:], layer.sources[k:] - begin
-                neurons = slice(layer.first - first, layer.end - first)
-                low[:, neurons] += sure[:, source] @ above + may[:, source] @ below
-                high[:, neurons] += may[:, source] @ above + sure[:, source] @ below
+                least, most = sure[:, source], may[:, source]
+                low[:, layer.first - first : layer.end - first] += least @ above + most @ below
+                high[:, layer.first - first : layer.end - first] += most @ above + least @ below
         return self.chip.after(state, (low, high), t)
 
     def before(self, t, far, single):
@@ -146,8 +146,7 @@ class Groups:
         chip, rows = self.chip, len(seen[0])
         state = [np.repeat(each, rows, axis=0) for each in state]
         table, lost = np.zeros((rows, REACH, chip.classes), int), np.zeros((rows, chip.classes), int)
-        # rows that are not over yet, and the first neuron of those that are not in all of them
-        left, first = np.arange(rows), 0
+        left, first = np.arange(rows), 0  # rows, and neurons from this one on, that are not over yet
         for s in range(t, len(self.counts)):
             state = self.step(state, s, seen if s == t else None)
             known, (low, high) = (
@@ -164,7 +163,7 @@ class Groups:
             goes_on = ~over.all(axis=1)
             if not goes_on.any():
                 break
-            # neurons that are over stay so if no others feed them
+            # neurons that are over remain so if no others feed them
             end = max(each for each in self.ends if over[:, : max(each - first, 0)].all())
             state = [each[goes_on, end - first :] for each in state]
             left, lost, first = left[goes_on], lost[goes_on], end
