@@ -21,6 +21,7 @@ from runpy import run_path
 
 import numpy as np
 
+VERSION = 2  # of certificates
 LIMIT = 2**23 - 1  # of currents and membranes
 FAR = 2**40
 
@@ -272,7 +273,10 @@ def run(chip, events, flips, decision):
 
 def beside(name):
     """What a file beside this one defines."""
-    return run_path(str(Path(__file__).with_name(name)))
+    path = Path(__file__).with_name(name)
+    if not path.is_file():
+        raise SystemExit(f"not checked: {name} is missing beside this program; copy it there")
+    return run_path(str(path))
 
 
 def check(chip, events, bins, claim):
@@ -321,7 +325,9 @@ def main(netlist, certificate):
 def check_all(netlist, certificate):
     """Check all claims; the first that does not hold ends it."""
     about, arrays = load(certificate)
-    require(about.get("format") == "spikeloom-certificate" and about.get("version") == 2, "the format")
+    require(about.get("format") == "spikeloom-certificate", "the format")
+    version = about.get("version")
+    require(version == VERSION, f"version {version}; this program checks {VERSION}, so certify again")
     found = hashlib.sha256(Path(netlist).read_bytes()).hexdigest()
     require(found == about["netlist_sha256"], f"a certificate of another netlist, {about['netlist_sha256']}")
     network, cores = load(netlist)

@@ -4,16 +4,16 @@ Let events change at the steps t1 < t2 < …; those of one step are a *group*. A
 the earliest. So votes before t1 + lag are the known ones, and those from ti + lag to before ti+1 + lag depend on no
 group after i. ``turned`` bounds how many of these can turn by interval arithmetic: from all registers that any input
 can bring about (``before``), through the known events between the groups, the group (its one change, or any), and
-known events again. Decay, sums, saturation and comparison are monotone, and a reset leaves zero or what is below the
+known events again. Decay, sums, saturation and comparison are monotone, and a reset leaves zero or at most the
 threshold, so no run leaves its bounds. They are followed until every membrane is where known events make every spike
 the known one for ever (``safe``: an interval, found backwards). That ends a layer too, with those before it, if none
 after it feeds them.
 
 Of the group before one is known that it was at least so many steps ago, or that it was one event exactly so many steps
 ago: then bounds are the widest of runs with each event of that step. ``none_of`` adds the worst of all steps, distances
-and sizes of groups that have k events together. By rule 3 the certificate names steps, and what shall be told apart
-there; all else counts as if nothing were known of the past. If no class makes up for what it lacks, no k events alter
-the decision.
+and sizes of groups that have k events together; a group is of one event, or of any number, which counts as two. By rule
+3 the certificate names steps, and what shall be told apart there; all else counts as if nothing were known of the past.
+If no class makes up for what it lacks, no k events alter the decision.
 """
 
 import numpy as np

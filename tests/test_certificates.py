@@ -3,6 +3,7 @@
 import ast
 import io
 import json
+import shutil
 import subprocess
 import sys
 import tokenize
@@ -124,6 +125,13 @@ def test_certificates_of_several_events_hold_and_planted_errors_do_not(tmp_path)
     code, said = checked(tmp_path, tmp_path / "other.loom", good)
     assert code == 1
     assert "another netlist" in said
+    older = json.dumps(json.loads(str(good["manifest"])) | {"version": 1})
+    assert "version 1; this program checks 2, so certify again" in planted(manifest=older)
+    alone = shutil.copy(CHECKER, tmp_path)
+    words = [sys.executable, "-I", alone, tmp_path / "net.loom", tmp_path / "cert"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == "not checked: check_groups.py is missing beside this program; copy it there\n"
 
 
 @pytest.mark.parametrize(("seed", "parts"), [(4, 1), (0, 2), (4, 2)])
