@@ -258,11 +258,14 @@ def test_a_folder_of_one_split_has_the_bins_that_are_said_beside_it(said):
 
 def test_recordings_that_last_longer_than_the_clocks_are_said(said, place):
     write(place / "longer" / "test", seed=2, steps=40)
+    write(place / "longer" / "train", seed=1, steps=20)
     few = "--features 2 --hidden 4 --epochs 1 --data data --bin 0.05 --taxels 6"
     said(f"train --system mlp {few} --clocks 4 -o clocks.pt")
     said("compile clocks.pt -o clocks.loom")
     told = "warning: longer: up to 40 steps, the network's clocks stop after 32"
-    assert told in said("run clocks.loom --data longer")[1]
+    for command in ("run", "certify --most 1", "stress --checkpoint clocks.pt --seeds 1"):
+        assert said(f"{command} clocks.loom --data longer")[1].count(told) == 1
+    assert told in said("lean clocks.pt --data longer")[1]
     assert "clocks stop" not in said("run clocks.loom --data data")[1]
 
 

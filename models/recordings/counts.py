@@ -74,8 +74,9 @@ def number(count: int, noun: str) -> str:
 
     Examples
     --------
-    >>> number(1, "class"), number(2000, "event")
-    ('1 class', '2,000 events')
+    >>> number(1, "class"), number(2000, "event"), number(2, "polarity")
+    ('1 class', '2,000 events', '2 polarities')
     """
     plural = f"{noun}es" if noun.endswith("s") else f"{noun}s"
+    plural = f"{noun[:-1]}ies" if noun.endswith("ty") else plural
     return f"{count:,} {noun if count == 1 else plural}"

@@ -33,6 +33,7 @@ from spikeloom.compiler.errors import DataError, OptionError, require_least
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.networks.layers import time_first
 from spikeloom.models.networks.networks import Sizes, SpikingNet, TrainedModule, Weights
+from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.evaluate import evaluate, loss_of, one_thread, require_finite
 from spikeloom.models.training.recipes import ADAMW, COSINE, PLATEAU, RELEASED, Recipe, plateau
@@ -303,9 +304,9 @@ def _require_suited(recordings: Recordings, architecture: Sizes) -> None:
     shape = recordings.events.shape[1:3]
     wanted = (architecture.taxels, architecture.channels)
     if shape != wanted:
+        found = f"{number(shape[0], 'taxel')} and {number(shape[1], 'polarity')}"
         raise DataError(
-            f"{where}: {shape[0]} taxels and {shape[1]} polarities, the network has {wanted[0]} and {wanted[1]}; "
-            "use the graph of this sensor"
+            f"{where}: {found}, the network has {wanted[0]} and {wanted[1]}; use the graph of this sensor"
         )
     highest = int(recordings.labels.max())
     if highest >= architecture.classes:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from spikeloom.compiler.dynamics import Clocks
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.targets.netlist_file import Netlist, names_of, origin_of
 from spikeloom.models.recordings import events
@@ -318,14 +319,19 @@ def load_recordings(
         groups=getattr(request, "groups", None),
         window=None if said is None else parse_window(said),
     )
+    warn_of_length(events.joined_bins(data, netlist.bins), netlist.clocks, origin_of(netlist.provenance))
     return in_steps(data, netlist) if joined else data
 
 
 def in_steps(data: Recordings, netlist: Netlist) -> Recordings:
     """Recordings in steps of a network, as long as it needs."""
-    data = events.joined_bins(data, netlist.bins)
-    length = netlist.clocks.length
-    steps = origin_of(netlist.provenance).get("steps", length)
+    return events.of_length(events.joined_bins(data, netlist.bins), netlist.clocks.length)
+
+
+def warn_of_length(data: Recordings, clocks: Clocks, origin: Mapping[str, Any]) -> None:
+    """Say what of recordings, in steps of a network, goes beyond what it was trained for."""
+    length = clocks.length
+    steps = origin.get("steps", length)
     if length is not None and (
         late := sum(int(part.events[..., steps:].sum(dtype=np.int64)) for part in data.parts())
     ):
@@ -335,13 +341,12 @@ def in_steps(data: Recordings, netlist: Netlist) -> Recordings:
             else f"they may move votes until step {length}, later ones are not used"
         )
         tell(f"warning: {data.source}: {number(late, 'event')} after the network's {steps} steps: {used}")
-    clocks = netlist.clocks.channels * netlist.clocks.steps
-    if clocks and length is None and data.steps > clocks:
+    ticking = clocks.channels * clocks.steps
+    if ticking and length is None and data.steps > ticking:
         tell(
-            f"warning: {data.source}: up to {data.steps} steps, the network's clocks stop after {clocks}; are these "
+            f"warning: {data.source}: up to {data.steps} steps, the network's clocks stop after {ticking}; are these "
             "recordings as long as its own?"
         )
-    return events.of_length(data, length)
 
 
 def name_of(source: str | Recordings) -> str:

@@ -14,7 +14,13 @@ from spikeloom.runtime.inputs.checkpoint import load_graph
 from spikeloom.runtime.inputs.compilation import known_of, remembered
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.network import load_network
-from spikeloom.runtime.inputs.recordings import recordings, require_splits, step_of, warn_of_shared
+from spikeloom.runtime.inputs.recordings import (
+    recordings,
+    require_splits,
+    step_of,
+    warn_of_length,
+    warn_of_shared,
+)
 from spikeloom.runtime.report.console import progress
 from spikeloom.runtime.report.encode import encode
 from spikeloom.runtime.report.sections import Outcome
@@ -61,6 +67,7 @@ def run(request: LeanRequest) -> Outcome:
     known = recordings(request.data, "train", **shared)
     reported = recordings(request.data, request.split, limit=request.limit, bins=taken.bins, **shared)
     training = of_length(joined_bins(known, taken.bins), taken.clocks.length)
+    warn_of_length(reported, taken.clocks, trained)
     test = of_length(reported, taken.clocks.length)
     warn_of_shared(training, test)
     result, netlist, spared = study(loaded, training, test, request.differ, request.output)

@@ -11,6 +11,7 @@ import numpy as np
 from spikeloom.compiler.errors import DataError, ModelError, OptionError
 from spikeloom.compiler.targets.netlist_file import Netlist, names_of, origin_of
 from spikeloom.compiler.types import IntArray
+from spikeloom.models.recordings.counts import number
 from spikeloom.models.recordings.eventlines import EventLines
 from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.report.sections import Outcome
@@ -37,7 +38,7 @@ def run(request: WatchRequest) -> Outcome:
     bins = _bins(request, netlist)
     if netlist.polarities != 2:
         raise ModelError(
-            f"{request.netlist}: {netlist.polarities} polarities per taxel found, event lines have 2; "
+            f"{request.netlist}: {number(netlist.polarities, 'polarity')} per taxel found, event lines have 2; "
             "watch a network for events of two polarities"
         )
     name = "standard input" if request.input == "-" else request.input
