@@ -76,13 +76,18 @@ def state(name: str) -> str:
     script = re.match(r"python (benchmarks/\S+)", read(RESULTS / name).get("command", ""))
     if script and not (ROOT / script[1]).exists():
         return "finished"
-    files = read(RUNS / name).get("files", {})
+    files = flat(read(RUNS / name).get("files", {}))
     changed = [file for file, noted in files.items() if digest(file) != noted]
     return f"stale ({', '.join(changed[:3])})" if changed else "up to date" if files else "not known"
 
 
-def depends(log: Path, place: Path) -> dict[str, str]:
-    """Digests of the files of the repository that are in a log; `place` holds the copy of this folder."""
+def flat(folders: dict[str, dict[str, str]]) -> dict[str, str]:
+    """Digests of files, in a record by folder."""
+    return {os.path.join(folder, file): at for folder, files in folders.items() for file, at in files.items()}
+
+
+def depends(log: Path, place: Path) -> dict[str, dict[str, str]]:
+    """Digests of the files of the repository that are in a log, by folder; `place` holds the copy of this folder."""
     found = set()
     for line in set(log.read_text("utf-8").splitlines()):
         path = Path(source_from_cache(line) if line.endswith(".pyc") else line)
@@ -90,7 +95,10 @@ def depends(log: Path, place: Path) -> dict[str, str]:
         if path.is_relative_to(ROOT) and path.suffix != ".md":
             found.add(str(path.relative_to(ROOT)))
     tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)
-    return {file: digest(file) for file in sorted(found & set(tracked.stdout.splitlines()))}
+    known: dict[str, dict[str, str]] = {}
+    for file in sorted(found & set(tracked.stdout.splitlines())):
+        known.setdefault(os.path.dirname(file), {})[os.path.basename(file)] = digest(file)
+    return known
 
 
 def run(name: str, place: Path, sources: list[Path]) -> dict[str, Any]:

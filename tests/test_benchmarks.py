@@ -193,7 +193,7 @@ def test_a_result_that_was_edited_differs_and_its_record_is_written(stored):
     assert found.startswith("/figures/validation_20ms")
     assert json.loads(file.read_text())["figures"] == true["figures"]
     assert stored.state(name) == "up to date"
-    read = stored.read(stored.RUNS / name)["files"]
+    read = stored.flat(stored.read(stored.RUNS / name)["files"])
     expected = {"benchmarks/figures.py", "benchmarks/results/paper/cells.json", "compiler/__init__.py"}
     assert expected <= read.keys()
 
@@ -205,7 +205,7 @@ def test_a_result_is_stale_when_what_its_command_read_does_something_else(stored
     files = ("code.py", "prices.toml")
     stored.digest.cache_clear()
     (stored.RUNS / "x.json").parent.mkdir(exist_ok=True)
-    (stored.RUNS / "x.json").write_text(json.dumps({"files": {each: stored.digest(each) for each in files}}))
+    (stored.RUNS / "x.json").write_text(json.dumps({"files": {"": {each: stored.digest(each) for each in files}}}))
     states = []
     for name, text in [
         ("code.py", 'def double(x):\n    """Twice."""\n    return 2 * x  # of it\n'),
