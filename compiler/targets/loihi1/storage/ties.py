@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
-from spikeloom.compiler.ir import Sparse, added_up
+from spikeloom.compiler.ir import Sparse, added_up, row_parts
 from spikeloom.compiler.targets.loihi1.bounds import extreme_membranes, one_sided
 from spikeloom.compiler.targets.loihi1.integers import IntegerPopulation, IntegerProjection
 from spikeloom.compiler.targets.loihi1.registers import (
@@ -47,21 +47,19 @@ def _steps(weights: Mapping[int, Sparse]) -> IntArray:
     return step
 
 
-def _whole(layer: FloatLayer) -> tuple[dict[int, Sparse], IntArray, BoolArray]:
-    """Weights from each source, biases, and which neurons have whole numbers alone, in parts of ``WHOLE``.
-
-    No weights and biases of other neurons.
-    """
+def _whole(layer: FloatLayer) -> BoolArray:
+    """Which neurons have weights, and whole numbers alone in parts of ``WHOLE``, as is their bias."""
     bias = layer.population.bias * WHOLE
     whole = np.abs(bias - np.rint(bias)) <= CLOSE * np.abs(bias)
-    floats = added_up((p.pre, p.weight * WHOLE) for p in layer.projections)
-    for weight in floats.values():
-        apart = abs(weight - weight.rint()) - CLOSE * abs(weight)
-        whole &= apart.max(axis=1).toarray().ravel() <= 0
-        whole &= abs(weight).max(axis=1).toarray().ravel() < 2**62
-    kept = sparse.diags_array(whole.astype(np.float64))
-    weights = {pre: (kept @ weight.rint()).tocsr() for pre, weight in floats.items()}
-    return weights, np.where(whole, np.rint(bias), 0).astype(np.int64), whole
+    largest = max((p.weight for p in layer.projections), key=lambda weight: weight.nnz)
+    for rows in row_parts(largest):  # most layers have none, and large ones would fill the memory
+        most = np.zeros(len(whole[rows]))
+        for weight in added_up((p.pre, p.weight[rows] * WHOLE) for p in layer.projections).values():
+            apart = abs(weight - weight.rint()) - CLOSE * abs(weight)
+            whole[rows] &= apart.max(axis=1).toarray().ravel() <= 0
+            most = np.maximum(most, abs(weight).max(axis=1).toarray().ravel())
+        whole[rows] &= (most > 0) & (most < 2**62)
+    return whole
 
 
 def _stored(stored: Rounded) -> dict[int, Sparse]:
@@ -131,7 +129,13 @@ def ties_moved(layer: FloatLayer, stored: Rounded) -> int:
     if population.alpha:
         return 0
     lasting = population.beta == 1
-    floats, bias, whole = _whole(layer)
+    whole = _whole(layer)
+    if not whole.any():
+        return 0
+    kept = sparse.diags_array(whole.astype(np.float64))
+    floats = added_up((p.pre, p.weight * WHOLE) for p in layer.projections)
+    floats = {pre: (kept @ weight.rint()).tocsr() for pre, weight in floats.items()}
+    bias = np.where(whole, np.rint(population.bias * WHOLE), 0).astype(np.int64)
     step = _steps(floats)
     weights = _stored(stored)
     chip_step = _steps(weights)
