@@ -83,7 +83,7 @@ def state(name: str) -> str:
 
 def flat(folders: dict[str, dict[str, str]]) -> dict[str, str]:
     """Digests of files, in a record by folder."""
-    return {os.path.join(folder, file): at for folder, files in folders.items() for file, at in files.items()}
+    return {str(Path(folder, file)): at for folder, files in folders.items() for file, at in files.items()}
 
 
 def depends(log: Path, place: Path) -> dict[str, dict[str, str]]:
@@ -96,8 +96,8 @@ def depends(log: Path, place: Path) -> dict[str, dict[str, str]]:
             found.add(str(path.relative_to(ROOT)))
     tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)
     known: dict[str, dict[str, str]] = {}
-    for file in sorted(found & set(tracked.stdout.splitlines())):
-        known.setdefault(os.path.dirname(file), {})[os.path.basename(file)] = digest(file)
+    for file in map(Path, sorted(found & set(tracked.stdout.splitlines()))):
+        known.setdefault(str(file.parent), {})[file.name] = digest(str(file))
     return known
 
 

@@ -205,7 +205,9 @@ def test_a_result_is_stale_when_what_its_command_read_does_something_else(stored
     files = ("code.py", "prices.toml")
     stored.digest.cache_clear()
     (stored.RUNS / "x.json").parent.mkdir(exist_ok=True)
-    (stored.RUNS / "x.json").write_text(json.dumps({"files": {"": {each: stored.digest(each) for each in files}}}))
+    (stored.RUNS / "x.json").write_text(
+        json.dumps({"files": {".": {each: stored.digest(each) for each in files}}})
+    )
     states = []
     for name, text in [
         ("code.py", 'def double(x):\n    """Twice."""\n    return 2 * x  # of it\n'),
