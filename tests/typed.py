@@ -212,10 +212,15 @@ FEW_CANDIDATES = (
 """With which ``smallest`` tries two counting networks and their like."""
 
 
-def smallest() -> list[bytes]:
-    for module, changes in FEW_CANDIDATES:  # for good: tests/test_readers.py puts back what was there
+def few_candidates() -> None:
+    """Let ``smallest`` try few in this process, for good: tests/test_readers.py puts back what was there."""
+    for module, changes in FEW_CANDIDATES:
         for constant, value in changes.items():
             setattr(module, constant, value)
+
+
+def smallest() -> list[bytes]:
+    few_candidates()
     line = LINES["store of smallest"][0].replace("{x}", "written/x.sqlite")
     return [written_by("mlp", line, "x.sqlite")]
 
