@@ -217,6 +217,12 @@ def random_counters(
     )
 
 
+def without_idle(counters) -> Counters:
+    """The same without counters that no weight leads on, as training makes them."""
+    kept = counters.weight.any(axis=0)
+    return replace(counters, counter=counters.counter[kept], weight=counters.weight[:, kept])
+
+
 def counter_events(seed, counters, rate=0.3):
     """A recording (taxels, polarities, steps) that is silent in the ramp."""
     shape = counters.taxels, counters.polarities, counters.clocks.length

@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from made_files import CLASSES, TAXELS, events, recorded, recordings_folder, sparse_events
 from numpy.testing import assert_array_equal
-from random_crossbars import counter_events, random_counters
+from random_crossbars import random_events, random_network
 from random_netlists import large_netlist, lively, netlists, recordings, voting
 from random_networks import chain, random_checkpoint, ring
 
@@ -285,9 +285,9 @@ def test_verdicts_are_those_of_plain_runs(bins, clocks):
 
 
 def test_a_chip_that_knows_no_short_cut_runs_every_change():
-    counters = random_counters(1, taxels=2, classes=3)
-    netlist = compile_crossbars(counters).netlist
-    given = np.stack([counter_events(seed, counters) for seed in (5, 6)])
+    network = random_network(1, taxels=2)
+    netlist = compile_crossbars(network).netlist
+    given = random_events(5, network)
     for one, found in zip(given, study_of(netlist, given, shift=1).certificates, strict=True):
         cells, alter = cells_of(one, netlist), 0
         for channel, step in cells.cells.tolist():

@@ -6,20 +6,23 @@ from functools import cached_property
 
 import numpy as np
 
+from spikeloom.compiler.counters import Counters
 from spikeloom.compiler.targets.base import Target
 from spikeloom.compiler.targets.truenorth.legalize import require_legal
 from spikeloom.compiler.targets.truenorth.netlist import CrossbarNetlist, read_crossbars, unlike
 from spikeloom.compiler.targets.truenorth.passes import Source, compile_crossbars
 from spikeloom.compiler.types import BoolArray, EventArray, IntArray
-from spikeloom.runtime.machines.base import Machine, Model, Run
+from spikeloom.runtime.machines.base import Model, Run
+from spikeloom.runtime.machines.counting import Counting
 from spikeloom.runtime.machines.netlist_check import NetlistCheck
 from spikeloom.runtime.machines.truenorth import cost, engine, spec
+from spikeloom.runtime.machines.truenorth.counters import counters_in
 from spikeloom.runtime.machines.truenorth.model import model_of
 from spikeloom.runtime.machines.truenorth.spec import Trace
 
 
 @dataclass(frozen=True)
-class TrueNorth(Machine):
+class TrueNorth(Counting):
     """A netlist that breaks no rule of its chip, and its simulator."""
 
     netlist: CrossbarNetlist
@@ -28,6 +31,11 @@ class TrueNorth(Machine):
     @cached_property
     def _engine(self) -> engine.Engine:
         return engine.prepare(self.netlist)
+
+    @cached_property
+    def counters(self) -> Counters | None:
+        """Read back from the cores and lowered again."""
+        return counters_in(self.netlist, self.target)
 
     @property
     def weight_bits(self) -> int:

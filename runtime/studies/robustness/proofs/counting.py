@@ -12,16 +12,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import floor
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spikeloom.compiler.counters import BLOCK
+from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.ir import Sparse, added_up
 from spikeloom.compiler.targets.compartments import MEMBRANE_MAX, MEMBRANE_SHIFT, IntegerNetwork
 from spikeloom.compiler.types import BoolArray, IntArray
 from spikeloom.runtime.machines.base import Machine
 from spikeloom.runtime.machines.capabilities import Comparable
+from spikeloom.runtime.machines.counting import Counting
 from spikeloom.runtime.studies.robustness.proofs.entries import Cells
 
 FAR = 1 << 40
@@ -40,19 +42,33 @@ class Tally:
     channels: int
     part: int  # Steps of a part
     steps: int
+    late: bool = False  # Whether sums are right after the last event only, see :class:`Counting`
+
+    def times(self, those: IntArray | slice, events: IntArray) -> IntArray:
+        """How often some counters spike within so many events of each, (…, counters)."""
+        count = self.count[those]
+        return np.where(events < count, 0, 1 + (events - count) // (count + BLOCK))
 
     def of(self, those: IntArray | slice, events: IntArray) -> IntArray:
         """What some counters add to the sums after so many events of each, (…, counters); (…, classes)."""
-        count = self.count[those]
-        times = np.where(events < count, 0, 1 + (events - count) // (count + BLOCK))
-        return np.asarray(times @ self.weight[:, those].T)
+        return np.asarray(self.times(those, events) @ self.weight[:, those].T)
+
+    def highest(self, those: IntArray | slice, events: IntArray, end: IntArray) -> IntArray:
+        """Most that a sum can have of them after so many events of each, if it is of so many in the end."""
+        if not self.late:
+            return self.of(those, events)
+        weight = self.weight[:, those].T
+        above = self.times(those, end) @ np.maximum(weight, 0)
+        return np.asarray(above + self.times(those, events) @ np.minimum(weight, 0))
 
     @cached_property
     def largest(self) -> int:
         """Most that an event adds to a sum, or takes from it."""
         counts = np.arange(self.steps + 1)[:, None]
-        each = (self.of(np.flatnonzero(self.group == group), counts) for group in np.unique(self.group))
-        return max(int(np.abs(np.diff(sums, axis=0)).max()) for sums in each)
+        weight = 2 * np.abs(self.weight) if self.late else self.weight  # above zero in the end, below before
+        each = (np.flatnonzero(self.group == group) for group in np.unique(self.group))
+        added = (np.diff(self.times(those, counts), axis=0) @ weight[:, those].T for those in each)
+        return max(int(np.abs(one).max()) for one in added)
 
     def groups(self, channel: IntArray, step: IntArray) -> IntArray:
         """Groups of entries."""
@@ -70,6 +86,8 @@ class Tally:
 
 def tally_of(machine: Machine) -> Tally | None:
     """What a counting network (:mod:`formats.counters`) is on the chip; None where a network is none."""
+    if isinstance(machine, Counting):
+        return None if machine.counters is None else _tally(machine.counters)
     length = machine.netlist.clocks.length
     if machine.layers[-2:] != ("sums", "votes") or length is None or not isinstance(machine, Comparable):
         return None
@@ -103,6 +121,24 @@ def tally_of(machine: Machine) -> Tally | None:
     )
 
 
+def _tally(counters: Counters) -> Tally:
+    """What a network is on a chip that holds it as it is."""
+    channels = counters.taxels * counters.polarities
+    length = counters.steps + counters.ramp
+    channel, part, count = counters.counter.T
+    return Tally(
+        group=part * channels + channel,
+        count=count,
+        weight=counters.weight << MEMBRANE_SHIFT,
+        slope=int(counters.slope) << MEMBRANE_SHIFT,
+        threshold=floor(counters.threshold) << MEMBRANE_SHIFT,
+        channels=channels,
+        part=counters.clocks.steps if counters.parts > 1 else length,
+        steps=length,
+        late=True,
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class _Option:
     """Another number of events in a group: what it costs, what it adds to the sums, and entries to flip."""
@@ -122,18 +158,21 @@ def least(
     entries of one group that hold events, and those that hold none, do the same.
     """
     recording = recording[: tally.channels]  # without clocks
-    ramp = tally.slope * np.arange(1, tally.steps + 1)
-    membranes = (
-        tally.of(slice(None), tally.events(recording)[:, tally.group]) + ramp[:, None]
-    )  # without a reset
+    ramp = tally.slope * np.arange(1, tally.steps + 1)[:, None]
+    events = tally.events(recording)[:, tally.group]
+    membranes = tally.of(slice(None), events) + ramp  # without a reset
     above = membranes > tally.threshold
     crossing = np.where(above.any(axis=0), above.argmax(axis=0), tally.steps)
     last = int(cells.cells[-1, 1])
     decision = int(np.argmax(votes))
     room = MEMBRANE_MAX + int(membranes.min())
     most = min(most, max(room - 1, 0) // max(tally.largest, 1))  # beyond that a sum might saturate
-    early = _early(tally, recording, np.delete(membranes, decision, axis=1)[: last + 1], decision, most)
+    highest = (tally.highest(slice(None), events, events[-1:]) + ramp)[: last + 1]
+    classes = np.arange(len(votes))
+    early = _early(tally, recording, highest, np.delete(classes, decision), most)
     if np.any(tally.steps - crossing != votes) or crossing[decision] <= last or early < 2:
+        return None
+    if _early(tally, recording, highest, classes, 1) < 2:  # then it matters when an event comes
         return None
     options = _options(tally, recording, cells, most)
     sums = membranes[-1] - tally.slope * tally.steps
@@ -171,23 +210,24 @@ def _options(tally: Tally, recording: BoolArray, cells: Cells, most: int) -> lis
     return by_group
 
 
-def _early(tally: Tally, recording: BoolArray, membranes: IntArray, decision: int, most: int) -> int:
-    """Events, up to one more than `most`, that it takes at least to lift another class above the threshold too soon.
+def _early(tally: Tally, recording: BoolArray, membranes: IntArray, classes: IntArray, most: int) -> int:
+    """Events, up to one more than `most`, that it takes at least to lift one of some classes above the threshold soon.
 
-    `membranes` (steps, other classes) are those of the steps up to the last with events.
+    `membranes` (steps, all classes) are those of the steps up to the last with events, or the most they can be.
     """
-    others = np.delete(np.arange(len(tally.weight)), decision)
+    membranes = membranes[:, classes]
     events = tally.events(recording)[: len(membranes)]
     near = np.flatnonzero((membranes + most * tally.largest > tally.threshold).any(axis=1))
-    lead = np.zeros((most + 1, len(near), len(others)), np.int64)
+    lead = np.zeros((most + 1, len(near), len(classes)), np.int64)
     for each in np.unique(tally.group).tolist():
         counters = np.flatnonzero(tally.group == each)
         before = lead.copy()
         seen = events[near, each][:, None]
-        known = tally.of(counters, seen)[:, others]
+        end = events[-1:, each][:, None]
+        known = tally.highest(counters, seen, end)[:, classes]
         for count in range(1, most + 1):
             for sign in (-1, 1):
-                gain = tally.of(counters, seen + sign * count)[:, others] - known
+                gain = tally.highest(counters, seen + sign * count, end + count)[:, classes] - known
                 if gain.any():
                     lead[count:] = np.maximum(lead[count:], before[: most + 1 - count] + gain)
     above = (lead + membranes[near] > tally.threshold).any(axis=(1, 2))
