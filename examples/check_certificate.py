@@ -10,7 +10,7 @@ again from the netlist, whose hash is compared, and the chip's integers, by thes
 and spikes on their way) go on alike, so one of them stands for both, with the most votes of either for each class
 beyond those of the decision.
 
-*k events* (Loihi): see ``check_groups.py``, and for counters ``check_counts.py``.
+*k events*: see ``check_groups.py`` (Loihi), and for counters ``check_counts.py``.
 """
 
 import hashlib
@@ -192,6 +192,7 @@ class TrueNorth(Chip):
         weight = a["weight"][neuron, a["axon_type"][axon]]
         self.connect(axon, neuron, weight, len(core), a["readout_class"], about["classes"])
         self.a, self.bin_ticks = a, about["bin_ticks"]
+        self.channels = about["taxels"] * about["polarities"] + about["clocks"]["channels"]
         line = {pair: n for n, pair in enumerate(zip(core.tolist(), a["axon_line"].tolist(), strict=True))}
         place = {xy: n for n, xy in enumerate(zip(a["core_x"].tolist(), a["core_y"].tolist(), strict=True))}
         wires = zip(a["wire_x"].tolist(), a["wire_y"].tolist(), strict=True)
@@ -291,9 +292,10 @@ def check(chip, events, bins, claim):
     most = {0: 0, 1: 1, 2: k, 3: k, 4: k}.get(rule, -1)
     require(k <= most, f"{k} events, which rule {rule} cannot prove")
     require(not alters, "that no single event alters the decision")
-    require(rule < 2 or isinstance(chip, Loihi), f"rule {rule}, which is for Loihi")
+    on_loihi = isinstance(chip, Loihi)
+    require(rule not in (2, 3) or on_loihi, f"rule {rule}, which is for Loihi")
     if rule == 4:
-        counts = beside("check_counts.py")["Counts"](chip, require)
+        counts = beside("check_counts.py")["Counts" if on_loihi else "Crossbars"](chip, require)
         require(counts.none_of(k, events, bins, decision), f"that no {k} events alter the decision")
     elif rule > 1:
         far, single, step = apart.T

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from commands import run
 from made_files import events, recordings_folder
-from random_crossbars import random_counters
+from random_crossbars import random_counters, without_idle
 from test_stability import small_netlist
 from zoo import MAKERS, over, specimen
 
@@ -22,6 +22,8 @@ from spikeloom.compiler.archive import archive_bytes, read_members
 from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.targets.loihi1.netlist import write_netlist
 from spikeloom.compiler.targets.loihi1.passes import compile_network
+from spikeloom.compiler.targets.truenorth.netlist import write_crossbars
+from spikeloom.compiler.targets.truenorth.passes import compile_crossbars
 from spikeloom.runtime.studies.robustness.proofs.entries import channels_of
 
 CHECKER = Path(__file__).parents[1] / "examples" / "check_certificate.py"
@@ -134,10 +136,14 @@ def test_certificates_of_several_events_hold_and_planted_errors_do_not(tmp_path)
     assert done.stderr == "not checked: check_groups.py is missing beside this program; copy it there\n"
 
 
+@pytest.mark.parametrize("chip", ["loihi1", "truenorth"])
 @pytest.mark.parametrize(("seed", "parts"), [(4, 1), (0, 2), (4, 2)])
-def test_certificates_of_counters_hold_and_planted_errors_do_not(tmp_path, seed, parts):
-    counters = random_counters(seed, taxels=2, parts=parts)
-    write_netlist(compile_network(counting_network(counters)).netlist, tmp_path / "net.loom")
+def test_certificates_of_counters_hold_and_planted_errors_do_not(tmp_path, seed, parts, chip):
+    counters = without_idle(random_counters(seed, taxels=2, parts=parts))
+    if chip == "loihi1":
+        write_netlist(compile_network(counting_network(counters)).netlist, tmp_path / "net.loom")
+    else:
+        write_crossbars(compile_crossbars(counters).netlist, tmp_path / "net.loom")
     test = events(seed, samples=3, taxels=2, steps=14, rate=0.25)
     recordings_folder(tmp_path / "data", test=test)
     good = certified(tmp_path, tmp_path / "net.loom", tmp_path / "data")
@@ -150,20 +156,26 @@ def test_certificates_of_counters_hold_and_planted_errors_do_not(tmp_path, seed,
         code, said = checked(tmp_path, tmp_path / "net.loom", good | by_counts | {"unaltered": fallen})
         assert code == 1
         assert "events alter the decision" in said
-    else:
+    elif chip == "loihi1":
         code, said = checked(tmp_path, tmp_path / "net.loom", good | {"unaltered": good["unaltered"] + 20})
         assert code == 1
         assert "no sum saturates" in said
 
 
-@over(["tactilesgnet", "counters-crossbars"])
-def test_numbers_of_events_are_believed_of_no_network_but_counters_on_loihi(tmp_path, name):
+@over(["tactilesgnet", "native"])
+def test_numbers_of_events_are_believed_of_no_network_but_counters(tmp_path, name):
     made = specimen(name)
     good = certified(tmp_path, made.netlist, made.data, "--most", "1")
     planted = {"rule": np.full_like(good["rule"], 4), "unaltered": good["unaltered"] * 2}
     code, said = checked(tmp_path, made.netlist, good | planted)
     assert code == 1
-    assert "counting network" in said or "which is for Loihi" in said
+    assert "counting network" in said or "one vote" in said
+    if name == "native":
+        code, said = checked(
+            tmp_path, made.netlist, good | planted | {"rule": np.full_like(good["rule"], 2)}
+        )
+        assert code == 1
+        assert "rule 2, which is for Loihi" in said
 
 
 @over(["tactilesgnet", "counters", "native", "counters-crossbars"])
