@@ -232,16 +232,12 @@ class Crossbars(Counts):
         require(all(map(bool, facts)), "that it is a counting network")
         late, shortest = first - 1 - (len(gates) > 0), self.again.min()
         require(rows.sum(axis=0).max() <= late <= shortest, "that all is passed on in time")
-        often, most = (
-            1 + chip.steps // shortest,
-            max(each.sum(axis=0).max() for each in (self.above, self.below)),
-        )
-        floor, most = a["negative_threshold"][votes].min(), often * most + ramp * (chip.steps + first)
-        require(most <= min(floor, 2**19 - 1), "that no sum saturates")
-        self.ramp, self.threshold = (
-            ONE * ramp,
-            ONE * threshold - 1,
-        )  # to be above which is to be at least that
+        often = 1 + chip.steps // shortest  # a counter spikes, at most
+        most = often * max(each.sum(axis=0).max() for each in (self.above, self.below))
+        floor = a["negative_threshold"][votes].min()
+        require(most + ramp * (chip.steps + first) <= min(floor, 2**19 - 1), "that no sum saturates")
+        self.ramp = ONE * ramp
+        self.threshold = ONE * threshold - 1  # to be above is to be at least the chip's
         self.group = weight[:, counters].argmax(axis=0)
         self.pairs = None
         if len(gates):

@@ -65,13 +65,13 @@ def proven(machine, one, change=lambda tally, _: tally):
 @pytest.fixture(scope="module")
 def tried():
     """Machines, recordings of them, and the fewest events that alter each decision, all tried."""
-    found = []
+    cases = []
     for seed, share in [*((seed, 1) for seed in range(5)), (0, 0.6), (14, 0.4), (40, 0.6)]:
         counters = counters_for(seed, taxels=2, steps=7, parts=1 + seed % 2)
         machine = machine_of(compile_crossbars(lower(counters, share, 1.0 + seed % 3)).netlist)
         recordings = sparse_events(seed, 3, 2, 2, 7, rate=0.3)
-        found += [(share, machine, one, broken(machine, one)) for one in recordings]
-    return found
+        cases += [(share, machine, one, broken(machine, one)) for one in recordings]
+    return cases
 
 
 def test_no_change_of_so_many_events_alters_what_is_proven_and_one_more_does(tried):
@@ -84,9 +84,9 @@ def test_no_change_of_so_many_events_alters_what_is_proven_and_one_more_does(tri
             continue
         assert events < fewest
         assert share < 1 or events == fewest - 1
-        found = certificate(machine, (one, 0, ""), shift=0, most=MOST, tally=tally_of(machine))
-        assert found.at_least == events
-        assert found.evidence.rule == (COUNTS if events else 0)
+        whole = certificate(machine, (one, 0, ""), shift=0, most=MOST, tally=tally_of(machine))
+        assert whole.at_least == events
+        assert whole.evidence.rule == (COUNTS if events else 0)
     assert sizes == {0, 1, 2, 3, None}
 
 

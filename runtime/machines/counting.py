@@ -9,14 +9,14 @@ from spikeloom.runtime.machines.base import Machine
 
 @dataclass(frozen=True)
 class Counting(Machine):
-    """Says of which counting network a netlist is, so that its decisions follow from numbers of events."""
+    """Says which counting network a netlist holds, if its decisions follow from numbers of events alone."""
 
     @property
     @abstractmethod
     def counters(self) -> Counters | None:
-        """Of which it is, neuron by neuron; None if of none, or if counts alone do not decide.
+        """That network, or None.
 
-        After the last event the membrane of each vote is its sum, and the ramp. After an earlier step it is at
-        most what weights above zero will have added in the end, less what those below had taken until then.
-        Silent steps after the data count as steps of data.
+        From the last event on, the membrane of a vote is its sum and the ramp. After an earlier step it is at
+        most the ramp, all that weights above zero add until the end, and what those below zero added so far.
+        Silent steps after the data may count as steps of data.
         """

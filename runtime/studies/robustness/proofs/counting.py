@@ -42,7 +42,7 @@ class Tally:
     channels: int
     part: int  # Steps of a part
     steps: int
-    late: bool = False  # Whether sums are right after the last event only, see :class:`Counting`
+    late: bool = False  # Whether membranes are the sums from the last event on only, see :class:`Counting`
 
     def times(self, those: IntArray | slice, events: IntArray) -> IntArray:
         """How often some counters spike within so many events of each, (…, counters)."""
@@ -54,7 +54,7 @@ class Tally:
         return np.asarray(self.times(those, events) @ self.weight[:, those].T)
 
     def highest(self, those: IntArray | slice, events: IntArray, end: IntArray) -> IntArray:
-        """Most that a sum can have of them after so many events of each, if it is of so many in the end."""
+        """Most that they can have added after so many events of each, if there are so many in the end."""
         if not self.late:
             return self.of(those, events)
         weight = self.weight[:, those].T
@@ -65,7 +65,7 @@ class Tally:
     def largest(self) -> int:
         """Most that an event adds to a sum, or takes from it."""
         counts = np.arange(self.steps + 1)[:, None]
-        weight = 2 * np.abs(self.weight) if self.late else self.weight  # above zero in the end, below before
+        weight = 2 * np.abs(self.weight) if self.late else self.weight  # twice: in the end, and before it
         each = (np.flatnonzero(self.group == group) for group in np.unique(self.group))
         added = (np.diff(self.times(those, counts), axis=0) @ weight[:, those].T for those in each)
         return max(int(np.abs(one).max()) for one in added)
