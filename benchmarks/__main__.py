@@ -104,7 +104,7 @@ def depends(log: Path, place: Path) -> dict[str, dict[str, str]]:
 def run(name: str, place: Path, sources: list[Path]) -> dict[str, Any]:
     """Run what made a result in an empty folder, and give its record; it is in ``benchmarks/results`` there."""
     shutil.copytree(HERE, place / "benchmarks")
-    for folder in ("docs", "tests"):
+    for folder in ("docs", "examples", "tests"):
         (place / folder).symlink_to(ROOT / folder)
     (place / "FOLDER").mkdir()
     for file in [file for folder in sources for file in folder.resolve().iterdir()]:
