@@ -224,7 +224,7 @@ class Trial:
         words = COMMANDS[self.command].split()
         child = Child(self.folder, words, self.fault).start().end()
         wrong = self._left(child, before, files_in(out))
-        states = any(file.suffix == ".state" for file in out.iterdir())
+        states = any(".state" in file.name and ".part" not in file.name for file in out.iterdir())
         if self.command.startswith("data convert, a folder"):
             shutil.rmtree(out / "x", ignore_errors=True)  # it writes no folder that is there
         again = [*words, "--resume"] if self.command in RESUMED and states else words
