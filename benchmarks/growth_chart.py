@@ -86,7 +86,7 @@ def draw_skins(result: dict[str, Any], stem: str) -> None:
         panel.annotate(
             label, (synapses[1], cost[1]), (6, -12), textcoords="offset points", color=colour, fontsize=9
         )
-    panel.set(ylabel="seconds (dashed: in proportion)", xlabel="synapses", xticks=[2e6, 5e6, 1e7, 2e7, 3e7])
+    panel.set(ylabel="seconds (dashed: in proportion)", xlabel="synapses", xticks=[2e6, 5e6, 1e7, 3e7, 1e8])
     panel.xaxis.set_major_formatter(lambda value, _: f"{value / 1e6:g} M")
     panel.xaxis.set_minor_formatter(NullFormatter())
     panel.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
