@@ -57,7 +57,7 @@ class Dask:
 
     def waited(self, file: Path) -> Path:
         until = time.monotonic() + 60
-        while not file.exists():
+        while not file.exists() or not file.stat().st_size:  # it is made before it is written
             assert time.monotonic() < until, (self.folder / "log").read_text()
             time.sleep(0.05)
         return file

@@ -486,7 +486,7 @@ REFUSED: dict[str, dict[str, str]] = {
         **dict.fromkeys(("chart", "lean"), "module: no such file"),
     },
     "whole file": {"chart": "a chart takes checkpoints"},
-    "polarities": {"watch": "polarities per taxel found, event lines have 2"},
+    "polarities": {"watch": "per taxel found, event lines have 2"},
 }
 """By trait of a network and by command, command with its door, or way out: words of the refusal."""
 
