@@ -189,7 +189,7 @@ def main() -> None:
     values["wide"] = (
         old.make("wide.pt", folder, values, arguments.core) if "wide" in " ".join(arguments.only) else ""
     )
-    results = made(*(load_data(arguments.recordings, each) for each in ("train", "test"))) | {
+    results = made(*(load_data(values["recordings"], each) for each in ("train", "test"))) | {
         "jobs": json.loads(output.read_text())["jobs"] if output.exists() else {}
     }
     for job in arguments.only:
