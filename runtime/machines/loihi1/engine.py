@@ -187,8 +187,7 @@ def simulate(
     given.flags.writeable = False  # or the kernels would be compiled twice, for either
     if charges is not None:
         sources = np.pad(charges.sources, ((0, 0), (0, -charges.sources.shape[1] % CHARGES)))
-        kinds, kind = np.unique(charges.updates, axis=0, return_inverse=True)
-        members = pack(kind.reshape(-1) == np.arange(len(kinds))[:, None])
+        kinds, members = charges.kinds
 
     def run(part: slice) -> None:
         fired, worked = run_part(engine, given[part], ends[part], trace, part)

@@ -6,6 +6,7 @@ the order of the netlist's ids. A batch of recordings adds one leading axis to e
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -34,12 +35,18 @@ class Counts(base.Counts):
     saturations: IntArray  # (…, layers) int64; compartment-steps whose membrane was clipped to its register
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Charges:
     """What events add to some sums of each chip step: times, energies, anything that is linear in them."""
 
     sources: IntArray  # (n_inputs + compartments, sums) int64; by an event of each channel, a spike of each compartment
     updates: IntArray  # (compartments, sums) int64; by an update of each compartment
+
+    @cached_property  # a recording takes a fraction of this
+    def kinds(self) -> tuple[IntArray, npt.NDArray[np.uint64]]:
+        """What an update may add (kinds, sums), each once, and the compartments of each kind at a bit each."""
+        kinds, kind = np.unique(self.updates, axis=0, return_inverse=True)
+        return kinds, pack(kind.reshape(-1) == np.arange(len(kinds))[:, None])
 
 
 def side_by_side(parts: Sequence[Charges]) -> Charges:
