@@ -135,7 +135,7 @@ def test_the_time_of_a_certificate_is_told_before(folder, half, monkeypatch):
     _, netlist, _ = half
     monkeypatch.setattr(certify, "TOLD_S", 0)
     given = ("--data", folder / "data", "--limit", "1", "--most", "1")
-    assert ", about 0 min, then every other change" in run("certify", netlist, *given)[2]
+    assert ", at most about 0 min, then every other change" in run("certify", netlist, *given)[2]
 
 
 def test_positions_that_are_given_to_compile_go_with_the_netlist(folder):

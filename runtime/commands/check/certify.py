@@ -48,7 +48,7 @@ def run(request: CertifyRequest) -> Outcome:
     data = load_recordings(request.data, request, machine.netlist, labels_for="certify", joined=False)
     singles = int(data.step_counts.sum()) * data.taxels * data.events.shape[2]
     seconds = expected_seconds(machine, data, request.jobs)
-    lasting = "" if seconds is None or seconds < TOLD_S else f", about {seconds / 60:,.0f} min"
+    lasting = "" if seconds is None or seconds < TOLD_S else f", at most about {seconds / 60:,.0f} min"
     tell(
         f"trying {singles:,} single events of {number(len(data), 'recording')}{lasting}, then every other change"
     )
