@@ -89,6 +89,7 @@ class Tree:
         given = [word.format(folder=self.folder, **values) for word in words.split()]
         line = ["taskset", "-c", str(core), "timeout", str(limit), *start, *given]
         more = {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "NUMBA_CACHE_DIR": str(cache)}
+        more["PYTHONDONTWRITEBYTECODE"] = ""  # modules are read as after a first start
         begun = time.perf_counter()
         with (self.folder / "log").open("wb") as log:
             child = subprocess.Popen(line, env=os.environ | more, stdout=subprocess.DEVNULL, stderr=log)

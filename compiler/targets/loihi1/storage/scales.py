@@ -199,10 +199,10 @@ def mantissa_scale(layer: Rounded) -> float:
 def _unit(projections: Sequence[Projection]) -> float:
     """Largest of 1, 1/2, … 1/64 of which all weights are multiples; 0 without one."""
     parts = [p.weight.data[part] for p in projections for part in entry_parts(p.weight)]
-    for unit in (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32, 1 / 64):
-        if all(np.all(part % unit == 0) for part in parts):
-            return unit
-    return 0.0
+    units = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32, 1 / 64)
+    if any(np.any(part % units[-1]) for part in parts):
+        return 0.0  # as most networks, after one pass over their weights
+    return next(unit for unit in units if not any(np.any(part % unit) for part in parts))
 
 
 def candidate(
