@@ -40,6 +40,9 @@ PATIENCE = 30
 AGAIN = 2
 """Seconds after which it is looked whether workers have come or gone."""
 
+WORKERS = {"distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": None}
+"""Dask's default has workers hand every freed array back to the system, which takes longer than the work."""
+
 ROOMS = ("compiler", "models", "runtime")
 
 LIBRARIES = ("numpy", "scipy", "torch", "numba")
@@ -165,6 +168,7 @@ def on_cluster(run: Callable[[Q], Outcome]) -> Callable[[Q], Outcome]:
 def _joined(address: str) -> Iterator[Any]:
     """A client of a scheduler, or of one that is started here with as many workers."""
     try:
+        from dask import config
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise OptionError(
@@ -184,6 +188,7 @@ def _joined(address: str) -> Iterator[Any]:
     if not workers.isdigit() or not int(workers):
         raise OptionError(f"--scheduler {address}: allowed are {LOCAL}1 or more, or an address")
     with (
+        config.set(WORKERS),
         LocalCluster(
             n_workers=int(workers), threads_per_worker=1, dashboard_address=None, silence_logs=logging.ERROR
         ) as here,
