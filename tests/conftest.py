@@ -10,6 +10,7 @@ from pathlib import Path
 
 import commands
 import pytest
+import torch
 from hypothesis import HealthCheck, settings
 from made_files import own_file, recordings_folder
 
@@ -44,6 +45,13 @@ released_checkpoint = _released("checkpoints/objects_manual.t7")  # trained on O
 checkpoints = _released("checkpoints")
 braille_net = _released("data/silicon/braille_rec_th1_6.net")  # it ran on a Loihi
 power_logs = _released("data/silicon/loihi-power-logs.zip")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let libraries start one thread where each worker has a core: those of all would wait for each other."""
+    if hasattr(config, "workerinput"):
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
+        torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

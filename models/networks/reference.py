@@ -7,10 +7,12 @@ of a joined network run one after the other, so that each has every spike that i
 """
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from threadpoolctl import ThreadpoolController
 
 from spikeloom.compiler.dynamics import RELAY_WEIGHT
 from spikeloom.compiler.interpret import threads
@@ -63,8 +65,15 @@ def _run(network: Network, events: AnyArray, dtype: np.dtype[Any], *, membranes:
                     spikes, compared = _with_relays(network, spikes, compared, first)
                 kept[layer][rows, part] = (compared if membranes else spikes).transpose(1, 0, 2)
 
-    list(threads().map(batch, range(0, samples, BATCH)))
+    with _blas().limit(limits=1, user_api="blas"):  # its threads and ours would wait for each other
+        list(threads().map(batch, range(0, samples, BATCH)))
     return kept
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    """What numpy multiplies matrices with; it takes milliseconds to find."""
+    return ThreadpoolController()
 
 
 def _drives(network: Network, dtype: np.dtype[Any]) -> list[Callable[[AnyArray], AnyArray]]:

@@ -20,7 +20,7 @@ from spikeloom.runtime.requests.main_job import InspectRequest
 
 LIBRARIES = (
     *("numpy", "scipy", "numba", "llvmlite", "torch", "networkx", "matplotlib", "onnx", "onnxruntime"),
-    *("h5py", "pooch", "joblib", "filelock", "jinja2", "tqdm", "shtab"),
+    *("h5py", "pooch", "joblib", "threadpoolctl", "filelock", "jinja2", "tqdm", "shtab"),
 )
 OPTIONAL = ("nir", "scikit-learn", "distributed")
 
