@@ -326,6 +326,15 @@ def main(netlist, certificate):
 
 def check_all(netlist, certificate):
     """Check all claims; the first that does not hold ends it."""
+    for file, given in claims(netlist, certificate):
+        cost = check(*given)
+        decision, unaltered = given[3][:2]
+        altered = f"; {cost} alter it" if cost else ""
+        print(f"{plain(file)}: decides {decision}; no {unaltered} events alter that{altered}", flush=True)
+
+
+def claims(netlist, certificate):
+    """Each recording's file, and what ``check`` takes: the chip, events, bins and what is claimed."""
     about, arrays = load(certificate)
     require(about.get("format") == "spikeloom-certificate", "the format")
     version = about.get("version")
@@ -347,10 +356,7 @@ def check_all(netlist, certificate):
         events[len(bins) :] = ticking
         claim = [int(arrays[name][n]) for name in ("decision", "unaltered", "rule")]
         changes = arrays["changes"][ends[n] : ends[n + 1]]
-        apart = arrays["pasts"][pasts[n] : pasts[n + 1]]
-        cost = check(chip, events, bins, (*claim, changes, apart))
-        altered = f"; {cost} alter it" if cost else ""
-        print(f"{plain(file)}: decides {claim[0]}; no {claim[1]} events alter that{altered}", flush=True)
+        yield file, (chip, events, bins, (*claim, changes, arrays["pasts"][pasts[n] : pasts[n + 1]]))
 
 
 if __name__ == "__main__":
