@@ -64,5 +64,6 @@ if __name__ == "__main__":
             row = {"certificate_sha256": digest, "files": {}}
         for known in verdicts(netlist, row["files"]):
             found[netlist.name] = row | summary(known)
+            sums = {key: sum(each[key] for each in found.values()) for key in ("recordings", "accepted")}
             with write_atomically(arguments.output) as file:
-                file.write((json.dumps(made() | {"verdicts": found}, indent=1) + "\n").encode())
+                file.write((json.dumps(made() | sums | {"verdicts": found}, indent=1) + "\n").encode())
