@@ -56,14 +56,14 @@ if __name__ == "__main__":
     parser.add_argument("netlists", type=Path, nargs="+")
     arguments = parser.parse_args()
     stored = json.loads(arguments.output.read_text("utf-8")) if arguments.output.exists() else {}
-    found: dict[str, Any] = stored.get("verdicts", {})
+    data = {
+        path.name: sha256_of(path) for path in (each.with_suffix(".cert") for each in arguments.netlists)
+    }
+    found = stored["verdicts"] if stored.get("data_sha256") == data else {}
     for netlist in arguments.netlists:
-        digest = sha256_of(netlist.with_suffix(".cert"))
-        row = found.get(netlist.name, {})
-        if row.get("certificate_sha256") != digest:
-            row = {"certificate_sha256": digest, "files": {}}
-        for known in verdicts(netlist, row["files"]):
-            found[netlist.name] = row | summary(known)
+        for known in verdicts(netlist, found.get(netlist.name, {}).get("files", {})):
+            found[netlist.name] = summary(known) | {"files": known}
             sums = {key: sum(each[key] for each in found.values()) for key in ("recordings", "accepted")}
+            result = made() | {"data_sha256": data} | sums | {"verdicts": found}
             with write_atomically(arguments.output) as file:
-                file.write((json.dumps(made() | sums | {"verdicts": found}, indent=1) + "\n").encode())
+                file.write((json.dumps(result, indent=1) + "\n").encode())
