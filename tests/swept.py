@@ -29,7 +29,9 @@ def square(job: Square) -> dict[str, Any]:
         log.write(f"{number}\n")
     time.sleep(payload.get("seconds", 0))
     match payload.get("trouble"):
-        case "die":
+        case "die once" if begun(payload["log"]).count(number) > 1:
+            pass
+        case "die" | "die once":
             os.kill(os.getpid(), signal.SIGKILL)
         case "data":
             raise DataError("x.zip: is empty; give another")
