@@ -199,7 +199,7 @@ def _sensor(request: SmallestRequest, taxels: int) -> Sensor:
 def _command(request: SmallestRequest) -> str:
     """The words that ask for the same search."""
     words = repeat.words(
-        repeat.given(request, ("data", "bin", "groups", *SENSOR, "target", "levels", "store"))
+        repeat.given(request, ("data", "bin", "groups", *SENSOR, "target", "levels", "time", "store"))
     )
     budgets = [word for budget in request.budget for word in ("--budget", budget)]
     return repeat.command("smallest", *words, *budgets, "-o", request.output)
