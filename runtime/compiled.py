@@ -237,6 +237,7 @@ class Compiled:
         *,
         split: str = "test",
         limit: int | None = None,
+        checkpoint: str | Network | None = None,
         shift: int = 25,
         most: int = 16,
         jobs: int | None = None,

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from spikeloom.runtime.requests.choices import (
+    NETWORK_FILES,
     ClusterChoice,
     ComparisonChoice,
     NetlistChoice,
+    NetworkChoice,
     RecordingsChoice,
     ShownConditionChoice,
 )
 from spikeloom.runtime.requests.fields import option
+
+if TYPE_CHECKING:
+    from spikeloom.compiler.ir import Network
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +51,14 @@ class StressRequest(ClusterChoice, ComparisonChoice, ShownConditionChoice, Recor
 
 
 @dataclass(frozen=True, kw_only=True)
-class CertifyRequest(ClusterChoice, NetlistChoice, RecordingsChoice):
+class CertifyRequest(ClusterChoice, NetlistChoice, NetworkChoice, RecordingsChoice):
     """Which decisions no small change of a recording alters: proven, not sampled."""
 
+    checkpoint: str | Network | None = option(
+        "float model of the netlist: how many changed events are proven to alter no decision of either",
+        metavar=NETWORK_FILES,
+        group="network",
+    )
     shift: int = option("largest shift to try", default=25, metavar="BINS")
     most: int = option("largest number of changed events that a proof is tried for", default=16, metavar="N")
     jobs: int | None = option("recordings at a time (default: one a core)", metavar="N")

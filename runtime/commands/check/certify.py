@@ -7,20 +7,28 @@ from dataclasses import replace
 from spikeloom.compiler.errors import require_least
 from spikeloom.compiler.files import sha256_of
 from spikeloom.models.recordings.counts import number
+from spikeloom.runtime.equivalence.reference import require_match
 from spikeloom.runtime.inputs.checkpoint import places_of
 from spikeloom.runtime.inputs.files import require_place, write_picture
+from spikeloom.runtime.inputs.network import LoadedNetwork, load_network
 from spikeloom.runtime.inputs.recordings import load_recordings
+from spikeloom.runtime.inputs.repeat import refuse
 from spikeloom.runtime.machines.backends import machine_for
+from spikeloom.runtime.machines.base import Machine
+from spikeloom.runtime.machines.capabilities import Comparable
 from spikeloom.runtime.report.console import tell
 from spikeloom.runtime.report.drawing import PICTURES
 from spikeloom.runtime.report.encode import write_json
 from spikeloom.runtime.report.sections import Outcome
 from spikeloom.runtime.requests.check import CertifyRequest
+from spikeloom.runtime.requests.choices import NetworkChoice
 from spikeloom.runtime.studies.cluster import on_cluster
 from spikeloom.runtime.studies.robustness.certificate_file import write_certificate
 from spikeloom.runtime.studies.robustness.certify_sections import sections, taxel_map
 from spikeloom.runtime.studies.robustness.exhaustive import certify, expected_seconds
+from spikeloom.runtime.studies.robustness.float_proof import beside
 from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
+from spikeloom.runtime.studies.robustness.provenance import compared
 from spikeloom.runtime.studies.robustness.results import Provenance
 
 KINDS = "; ".join(kind.what for kind in EXHAUSTIVE.values())
@@ -45,6 +53,7 @@ def run(request: CertifyRequest) -> Outcome:
     require_place(request.picture, "--picture", request, PICTURES)
     require_least(vars(request), shift=0, most=1, jobs=1)
     machine = machine_for(request.netlist)
+    loaded = _float_network(request, machine)
     data = load_recordings(request.data, request, machine.netlist, labels_for="certify", joined=False)
     singles = int(data.step_counts.sum()) * data.taxels * data.events.shape[2]
     seconds = expected_seconds(machine, data, request.jobs)
@@ -53,10 +62,26 @@ def run(request: CertifyRequest) -> Outcome:
         f"trying {singles:,} single events of {number(len(data), 'recording')}{lasting}, then every other change"
     )
     certificates = certify(machine, data, shift=request.shift, most=request.most, jobs=request.jobs)
+    provenance = Provenance.of(request, data.sha256)
+    if loaded is not None:
+        certificates = beside(certificates, loaded.network, machine.netlist, data, jobs=request.jobs)
+        provenance = compared(request, data.sha256, loaded)
     places = places_of(None, machine.netlist.provenance, data.taxels)
-    result = replace(certificates, provenance=Provenance.of(request, data.sha256), places=places)
+    result = replace(certificates, provenance=provenance, places=places)
     if request.certificate is not None:
         write_certificate(request.certificate, result, sha256_of(request.netlist))
     write_picture(request.picture, lambda: taxel_map(result))
     write_json(request.output, result)
     return Outcome(result, sections)
+
+
+def _float_network(request: CertifyRequest, machine: Machine) -> LoadedNetwork | None:
+    """What the netlist was made of, if it is given."""
+    if request.checkpoint is None:
+        refuse(request, [each.name for each in NetworkChoice.options()], "it says how --checkpoint is read")
+        return None
+    loaded = load_network(request.checkpoint, request, machine.netlist)
+    if isinstance(machine, Comparable):
+        require_match(machine.netlist, loaded.network)
+    loaded.require_same(request.netlist, machine.netlist, request.run)
+    return loaded

@@ -33,6 +33,13 @@ def sections(result: Certificates) -> Iterator[Section]:
         f"right: {percent(sum(each.right for each in certificates), count)}",
         f"no single event alters the decision: {percent(result.certified(1), count)}",
     ]
+    compared = [each for each in certificates if each.model is not None]
+    if compared:
+        alike = [each.alike for each in compared if each.alike is not None]
+        lines += [
+            f"float model and chip decide alike: {percent(len(alike), len(compared))}",
+            f"alike whichever single event changes, proven: {percent(sum(map(bool, alike)), len(compared))}",
+        ]
     rows = [
         [
             kind.what,
@@ -71,13 +78,17 @@ def _size(least: list[int | None]) -> str:
 def _radii(result: Certificates) -> Table:
     """Recordings by how many events they bear."""
     count = len(result.certificates)
+    compared = any(each.model is not None for each in result.certificates)
     rows = []
     for events in (1, 2, 3, 4, 6, 8, 12, 16):
         if events <= result.most:
             broken = sum(each.at_most is not None and each.at_most <= events for each in result.certificates)
             sure = result.certified(events)
-            rows.append([str(events), f"{sure} of {count}", f"{broken}", f"{count - sure - broken}"])
-    return Table(["changed events", "proven to stand", "shown to fall", "open"], rows)
+            alike = sum((each.alike or 0) >= events for each in result.certificates)
+            row = [str(events), f"{sure} of {count}", f"{broken}", f"{count - sure - broken}"]
+            rows.append([*row, f"{alike} of {count}"] if compared else row)
+    head = ["changed events", "proven to stand", "shown to fall", "open"]
+    return Table([*head, "float model alike"] if compared else head, rows)
 
 
 def _row(one: Certificate, names: Sequence[str] | None) -> list[str]:

@@ -179,6 +179,14 @@ class Evidence:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FloatModel:
+    """What the float model decides of a recording, in float32; no change of up to `at_least` events alters that."""
+
+    decision: int
+    at_least: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Certificate:
     """What is proven and known of one recording.
 
@@ -198,12 +206,20 @@ class Certificate:
     attack: tuple[str, ...]
     taxels: Mapping[str, tuple[int, ...]]
     phases: tuple[int, ...]
+    model: FloatModel | None = field(default=None, metadata={**key("float"), **OPTIONAL})
     evidence: Evidence | None = field(default=None, metadata=HIDDEN, compare=False)
 
     @property
     def right(self) -> bool:
         """Whether the decision is the label."""
         return self.label == self.decision
+
+    @property
+    def alike(self) -> int | None:
+        """Up to so many changed events float model and chip are proven to decide alike; None if they never do."""
+        if self.model is None or self.model.decision != self.decision:
+            return None
+        return min(self.at_least, self.model.at_least)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -3,7 +3,6 @@
 import zlib
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -16,7 +15,8 @@ from spikeloom.runtime.studies.robustness.curves import Requirement, curve, unme
 from spikeloom.runtime.studies.robustness.definition import TAXELS, Level
 from spikeloom.runtime.studies.robustness.pair import SIDES, Inputs, Outcome, Pair, evaluate
 from spikeloom.runtime.studies.robustness.perturbations import SAMPLED
-from spikeloom.runtime.studies.robustness.results import ComparedProvenance, InCondition, Run, Stress
+from spikeloom.runtime.studies.robustness.provenance import compared
+from spikeloom.runtime.studies.robustness.results import InCondition, Run, Stress
 from spikeloom.runtime.studies.robustness.threads import in_threads
 
 
@@ -58,14 +58,7 @@ def stress(request: StressRequest, names: Sequence[str], requirements: Sequence[
         not_applicable={name: reason for name, reason in reasons.items() if reason is not None},
         required=tuple(map(str, requirements)),
         missed=unmet(requirements, curves),
-        provenance=ComparedProvenance.of(
-            request,
-            data,
-            checkpoint=Path(str(request.checkpoint)).name,
-            checkpoint_sha256=loaded.sha256,
-            graph=loaded.graph,
-            **loaded.read_as,
-        ),
+        provenance=compared(request, data, loaded),
     )
 
 

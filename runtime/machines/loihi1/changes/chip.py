@@ -18,11 +18,9 @@ from spikeloom.compiler.targets.loihi1.registers import (
     MEMBRANE_SHIFT,
 )
 from spikeloom.compiler.types import IntArray
+from spikeloom.runtime.machines.bounds.arithmetic import LANES
 
 AnyArray = npt.NDArray[Any]
-
-LANES = 64
-"""Places of a block; each layer begins one."""
 
 NEVER = 2**31 - 1
 """Threshold of a place without a compartment."""

@@ -26,9 +26,10 @@ from spikeloom.compiler.layer_kernel import (
 )
 from spikeloom.compiler.targets.loihi1.registers import MEMBRANE_MAX, MEMBRANE_SHIFT
 from spikeloom.compiler.types import AnyArray, IntArray
+from spikeloom.runtime.machines.bounds.arithmetic import LANES, Safe
 from spikeloom.runtime.machines.changes import Changes, Effects
-from spikeloom.runtime.machines.loihi1.changes.chip import LANES, Chip, Known
-from spikeloom.runtime.machines.loihi1.changes.safe import Safe, safe, unsafe
+from spikeloom.runtime.machines.loihi1.changes.chip import Chip, Known
+from spikeloom.runtime.machines.loihi1.changes.safe import safe, unsafe
 
 
 class _Run(NamedTuple):

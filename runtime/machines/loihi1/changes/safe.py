@@ -7,24 +7,14 @@ stay silent, and be safe in the next step. A current that lasts must be the know
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from spikeloom.compiler.layer_kernel import compiled, compiled_and_cached
 from spikeloom.compiler.targets.loihi1.registers import DECAY_ONE, MEMBRANE_MAX
-from spikeloom.compiler.types import AnyArray
-from spikeloom.runtime.machines.loihi1.changes.chip import LANES, Chip, Known
-
-FAR = 1 << 30
-"""Beyond every membrane."""
-
-
-class Safe(NamedTuple):
-    """Membranes before each step, (steps + 1, places) int32, from which every later spike is the known one."""
-
-    low: AnyArray
-    high: AnyArray
+from spikeloom.runtime.machines.bounds.arithmetic import FAR, LANES, Safe
+from spikeloom.runtime.machines.loihi1.changes.chip import Chip, Known
 
 
 def safe(chip: Chip, known: Known) -> Safe:

@@ -1,10 +1,10 @@
-"""What groups of changed events can turn when little is known of the past: interval arithmetic on the chip's integers.
+"""What groups of changed events can turn when little is known of the past: interval arithmetic.
 
 A *group* is all that changes in one step. Of the past only this is known: the groups before it are at least
 so many steps ago, or the last of them was one event, so many steps ago. From there on the events are those of the
 known recording, and of runs with one event each the widest bounds are taken. Each place has a least and a
 largest membrane and current; a spike is sure, impossible or open; open spikes widen the sums that they
-reach. Decay is monotone, so that bounds stay bounds. A run is over once every membrane is :mod:`changes.safe`.
+reach. Decay is monotone, so that bounds stay bounds. A run is over once every membrane is safe.
 """
 
 from __future__ import annotations
@@ -13,18 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spikeloom.compiler.layer_kernel import charged, clear, compiled, copy, saturated
-from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, MEMBRANE_SHIFT
+from spikeloom.compiler.layer_kernel import clear, compiled, copy
 from spikeloom.compiler.types import AnyArray, IntArray
-from spikeloom.runtime.machines.loihi1.changes.chip import LANES, NEVER, Chip, Known
-from spikeloom.runtime.machines.loihi1.changes.kernel import integrate
-from spikeloom.runtime.machines.loihi1.changes.safe import Safe, unsafe
+from spikeloom.runtime.machines.bounds.arithmetic import LANES, step_block, surely, unknown, unsafe
 
 
 class Base(NamedTuple):
     """Bounds before a step, and spikes that are open then."""
 
-    # low_u, high_u, low_v, high_v: (places,) int32
+    # low_u, high_u, low_v, high_v: (places,), in the numbers of the arithmetic
     low_u: AnyArray
     high_u: AnyArray
     low_v: AnyArray
@@ -41,13 +38,16 @@ class Work(NamedTuple):
     high_u: AnyArray
     low_v: AnyArray
     high_v: AnyArray
-    # low, high: (places,) int32; what sums have more than the known ones, all zero between two steps
+    # low, high: (places,); what sums have more than the known ones, all zero between two steps
     low: AnyArray
     high: AnyArray
     # listed, kind: int64; sources whose spikes differ for sure (1 and -1), or may (2 and -2), by coming or going
     listed: IntArray
     kind: IntArray
     codes: AnyArray  # (places,) uint8; 3 for a sure spike, 2 for an open one
+    arrived: (
+        IntArray  # (2,) int64; how many spikes arrived last that differ, or may, and how many that differ
+    )
     live: AnyArray  # (blocks,) uint8; that are simulated
     turned: IntArray  # (classes,) int64; votes gained
 
@@ -56,144 +56,75 @@ class Work(NamedTuple):
 
 
 @compiled
-def _charge(current: Any, keep: Any, sums: Any, more: Any, first: Any) -> None:
-    for i in range(first, first + np.uint64(LANES)):
-        arrived = np.int32(np.int32(sums[i] + more[i]) << np.int32(MEMBRANE_SHIFT))
-        current[i] = saturated(charged(current[i], keep[i], arrived), np.int32(CURRENT_MAX))
-
-
-@compiled
-def _code(codes: Any, low: Any, high: Any, threshold: Any, fired: Any, first: Any) -> Any:
-    different = np.uint8(0)
-    for i in range(first, first + np.uint64(LANES)):
-        sure = np.uint8(low[i] > threshold[i])
-        may = np.uint8(high[i] > threshold[i])
-        codes[i] = np.uint8(sure + np.uint8(may << np.uint8(1)))
-        different |= np.uint8(np.uint8(sure ^ fired[i]) | np.uint8(may ^ fired[i]))
-    return different
-
-
-@compiled
-def _reset_low(low: Any, codes: Any, first: Any) -> None:
-    for i in range(first, first + np.uint64(LANES)):
-        v = min(low[i], np.int32(0)) if codes[i] == np.uint8(2) else low[i]
-        low[i] = np.int32(0) if codes[i] == np.uint8(3) else v
-
-
-@compiled
-def _reset_high(high: Any, codes: Any, threshold: Any, first: Any) -> None:
-    for i in range(first, first + np.uint64(LANES)):
-        v = max(threshold[i], np.int32(0)) if codes[i] == np.uint8(2) else high[i]
-        high[i] = np.int32(0) if codes[i] == np.uint8(3) else v
-
-
-@compiled
 def any_of(values: Any, first: Any) -> Any:
     """Whether a block has a value that is not zero."""
-    found = np.int32(0)
+    found = np.uint8(0)
     for i in range(first, first + np.uint64(LANES)):
-        found |= values[i]
+        found |= np.uint8(values[i] != 0)
     return found != 0
 
 
 @compiled
-def _wipe(values: Any, first: Any) -> None:
+def wipe(values: Any, first: Any) -> None:
+    """Set a block to zero."""
     for i in range(first, first + np.uint64(LANES)):
         values[i] = 0
 
 
 @compiled
 def _least_of(total: Any, weight: Any, sign: Any, first: Any, begin: Any, length: Any) -> None:
+    kind = weight.dtype.type  # cast, as a whole number would become one of 64 bits
     for i in range(length):
-        total[first + i] += min(np.int32(sign * weight[begin + i]), np.int32(0))
+        total[first + i] += min(kind(sign * weight[begin + i]), kind(0))
 
 
 @compiled
 def _most_of(total: Any, weight: Any, sign: Any, first: Any, begin: Any, length: Any) -> None:
+    kind = weight.dtype.type
     for i in range(length):
-        total[first + i] += max(np.int32(sign * weight[begin + i]), np.int32(0))
+        total[first + i] += max(kind(sign * weight[begin + i]), kind(0))
 
 
 @compiled
-def _both(total: Any, weight: Any, sign: Any, first: Any, begin: Any, length: Any) -> None:
-    for i in range(length):
-        total[first + i] += np.int32(sign * weight[begin + i])
-
-
-@compiled
-def arrive(chip: Chip, work: Any, n: Any) -> None:
+def arrive(chip: Any, work: Any, n: Any) -> None:
     """Let spikes arrive that differ, or may."""
     begins, target, offset, weight = chip.synapses
+    work.arrived[0] = n
+    work.arrived[1] = 0
     for k in range(n):
         source = work.listed[k]
         sure = abs(work.kind[k]) == 1
+        work.arrived[1] += sure
         sign = np.int32(1) if work.kind[k] > 0 else np.int32(-1)
         for r in range(begins[source], begins[source + 1]):
             first = np.uint64(target[r])
             begin = np.uint64(offset[r])
             length = np.uint64(offset[r + 1] - offset[r])
             if sure:
-                _both(work.low, weight, sign, first, begin, length)
-                _both(work.high, weight, sign, first, begin, length)
+                surely(chip, work, sign, first, begin, length)
             else:
                 _least_of(work.low, weight, sign, first, begin, length)
                 _most_of(work.high, weight, sign, first, begin, length)
 
 
 @compiled
-def step_block(chip: Chip, known: Known, work: Any, t: Any, block: Any, n: Any) -> Any:
-    """One step of a block; lists what spikes otherwise, or may, after `n` others."""
-    first = np.uint64(block * LANES)
-    channels, length = known.events.shape
-    if not chip.depth[block] <= t < chip.depth[block] + length:
-        _wipe(work.low_u, first)
-        _wipe(work.high_u, first)
-        _wipe(work.low_v, first)
-        _wipe(work.high_v, first)
-    else:
-        _charge(work.low_u, chip.keep_u, known.sums[t], work.low, first)
-        _charge(work.high_u, chip.keep_u, known.sums[t], work.high, first)
-        integrate(work.low_v, chip.keep_v, work.low_u, chip.bias, first, np.uint64(LANES))
-        integrate(work.high_v, chip.keep_v, work.high_u, chip.bias, first, np.uint64(LANES))
-        if _code(work.codes, work.low_v, work.high_v, chip.threshold, known.fired[t], first):
-            for c in range(block * LANES, (block + 1) * LANES):
-                fired = known.fired[t, c]
-                if work.codes[c] != 3 * fired:
-                    work.listed[n] = channels + c
-                    size = 2 if work.codes[c] == 2 else 1
-                    work.kind[n] = -size if fired else size
-                    n += 1
-        _reset_low(work.low_v, work.codes, first)
-        _reset_high(work.high_v, work.codes, chip.threshold, first)
-    _wipe(work.low, first)
-    _wipe(work.high, first)
+def list_open(known: Any, work: Any, t: Any, block: Any, n: Any) -> Any:
+    """List what spikes otherwise in a block, or may, by its codes."""
+    channels = len(known.events)
+    for c in range(block * LANES, (block + 1) * LANES):
+        fired = known.fired[t, c]
+        if work.codes[c] != 3 * fired:
+            work.listed[n] = channels + c
+            size = 2 if work.codes[c] == 2 else 1
+            work.kind[n] = -size if fired else size
+            n += 1
     return n
 
 
 @compiled
 def box_of(of: Any) -> Any:
-    """Bounds of currents and membranes, as :func:`safe.unsafe` takes them."""
+    """Bounds of currents and membranes, as :func:`arithmetic.unsafe` takes them."""
     return of.low_u, of.high_u, of.low_v, of.high_v
-
-
-@compiled
-def _unknown(chip: Chip, known: Known, start: Any, work: Any) -> Any:
-    """Bounds of registers before a step, whatever was before; lists those that may have fired otherwise than known."""
-    channels, length = known.events.shape
-    n = 0
-    most = np.int32(CURRENT_MAX)
-    for c in range(len(chip.bias)):
-        depth = chip.depth[c // LANES]
-        inside = chip.threshold[c] != NEVER and depth < start <= depth + length  # else all are zero
-        lasts = inside and chip.keep_u[c] != 0
-        work.low_u[c] = -most if lasts else np.int32(0)
-        work.high_u[c] = most if lasts else np.int32(0)
-        work.low_v[c] = chip.lowest[c] if inside else np.int32(0)
-        work.high_v[c] = max(chip.threshold[c], np.int32(0)) if inside else np.int32(0)
-        work.listed[n] = channels + c
-        work.kind[n] = -2 if known.fired[start - 1, c] else 2
-        n += inside
-    return n
 
 
 @compiled
@@ -208,7 +139,7 @@ def copy_state(source: Any, target: Any, n: Any) -> None:
 
 
 @compiled
-def past_of(chip: Chip, known: Known, start: Any, t: Any, base: Any, work: Any) -> Any:
+def past_of(chip: Any, known: Any, start: Any, t: Any, base: Any, work: Any) -> Any:
     """Bounds before step `t` where nothing is known of what was before `start`; spikes that are open then."""
     n = 0
     clear(work.low)
@@ -219,7 +150,7 @@ def past_of(chip: Chip, known: Known, start: Any, t: Any, base: Any, work: Any) 
         copy(known.membrane[t], base.low_v)
         copy(known.membrane[t], base.high_v)
     else:
-        n = _unknown(chip, known, start, work)
+        n = unknown(chip, known, start, work)
         for s in range(start, t):
             arrive(chip, work, n)
             n = 0
@@ -230,7 +161,7 @@ def past_of(chip: Chip, known: Known, start: Any, t: Any, base: Any, work: Any) 
 
 
 @compiled
-def watch(chip: Chip, known: Known, bounds: Safe, t: Any, base: Any) -> None:
+def watch(chip: Any, known: Any, bounds: Any, t: Any, base: Any) -> None:
     """Blocks in which a membrane is not safe before a step."""
     for block in range(len(chip.depth)):
         base.live[block] = unsafe(chip, known, bounds, box_of(base), t, block)
@@ -238,7 +169,7 @@ def watch(chip: Chip, known: Known, bounds: Safe, t: Any, base: Any) -> None:
 
 @compiled
 def hull_of(
-    chip: Chip, known: Known, start: Any, t: Any, channels: Any, n: Any, base: Any, work: Any, hull: Any
+    chip: Any, known: Any, start: Any, t: Any, channels: Any, n: Any, base: Any, work: Any, hull: Any
 ) -> Any:
     """Bounds before step `t` of all runs in which one event of step `start` changes; spikes that are open then.
 
