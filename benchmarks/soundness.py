@@ -2,15 +2,16 @@
 
     python benchmarks/soundness.py OUT.json
 
-Random small networks and counting networks on random recordings; every change of up to three events that a proof says
-is harmless is run from the first step to the last.
+Random small networks, their float models and counting networks on random recordings; every change of up to three events
+that a proof says is harmless is run from the first step to the last.
 """
 
 import argparse
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,15 @@ import numpy as np
 from made import made
 
 from spikeloom.compiler.formats.counters import counting_network
+from spikeloom.compiler.ir import Network
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.passes import compile_network
+from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.runtime.machines.backends import machine_of
 from spikeloom.runtime.machines.base import Machine
+from spikeloom.runtime.machines.bounds.floats import laid_out
 from spikeloom.runtime.studies.robustness.exhaustive import certificate
+from spikeloom.runtime.studies.robustness.float_proof import verdict
 from spikeloom.runtime.studies.robustness.proofs.counting import tally_of
 from spikeloom.runtime.studies.robustness.proofs.entries import cells_of, channels_of
 
@@ -37,21 +42,53 @@ STEPS = 10
 PART = 4096
 
 
-def networks(count: int) -> Iterator[tuple[str, Machine, int]]:
-    """Machines of both kinds, and their taxels; a network for every seed."""
+Votes = Callable[[Any], Any]
+"""Votes (samples, classes) of recordings (samples, channels, steps)."""
+
+Proof = Callable[[Any], tuple[int, int]]
+"""What is decided of a recording, and how many events are proven not to alter that."""
+
+
+def on_chip(machine: Machine) -> tuple[Votes, Proof]:
+    """How a netlist runs, and what is proven of it."""
+
+    def prove(one: Any) -> tuple[int, int]:
+        proof = certificate(machine, (one, 0, ""), shift=0, most=MOST, tally=tally_of(machine))
+        return proof.decision, proof.at_least
+
+    return machine.votes, prove
+
+
+def in_floats(network: Network, netlist: Netlist) -> tuple[Votes, Proof]:
+    """The same of a float model."""
+    model = laid_out(network, STEPS)
+
+    def prove(one: Any) -> tuple[int, int]:
+        proof = verdict(model, netlist, MOST, one)
+        return proof.decision, proof.at_least
+
+    return partial(model.votes, classes=network.classes), prove
+
+
+def networks(count: int) -> Iterator[tuple[str, Netlist, Votes, Proof]]:
+    """Netlists of both kinds for 2 taxels, one for every seed, and the float model of every other."""
     for seed in range(count):
         if seed % 4:
             drawn = random_checkpoint(seed=seed, taxels=2, features=5, sizes=(9, 8, CLASSES))
-            yield "layers", machine_of(compile_network(expand(drawn, ring(2))).netlist), 2
+            network = expand(drawn, ring(2))
+            netlist = compile_network(network).netlist
+            yield "layers", netlist, *on_chip(machine_of(netlist))
+            yield "float model", netlist, *in_floats(network, netlist)
         else:
             counters = random_counters(seed, taxels=2, classes=3)
-            yield "counters", machine_of(compile_network(counting_network(counters)).netlist), 2
+            netlist = compile_network(counting_network(counters)).netlist
+            yield "counters", netlist, *on_chip(machine_of(netlist))
 
 
-def altered(machine: Machine, one: Any, events: int, decision: int) -> tuple[int, int]:
+def altered(netlist: Netlist, votes: Votes, one: Any, events: int, decision: int) -> tuple[int, int]:
     """Changes of so many events of a recording, and those of them that alter its decision; all are run."""
-    cells = cells_of(one, machine.netlist)
-    channels = channels_of(one[None], machine.netlist)[0]
+    cells = cells_of(one, netlist)
+    channels = channels_of(one[None], netlist)[0]
     every = np.array(list(combinations(range(len(cells.cells)), events)))
     every = every[cells.cost[every].sum(axis=1) == events]
     wrong = 0
@@ -61,7 +98,7 @@ def altered(machine: Machine, one: Any, events: int, decision: int) -> tuple[int
         for change in part.T:
             channel, step = cells.cells[change].T
             runs[np.arange(len(part)), channel, step] ^= 1
-        wrong += int(np.count_nonzero(machine.votes(runs).argmax(axis=1) != decision))
+        wrong += int(np.count_nonzero(votes(runs).argmax(axis=1) != decision))
     return len(every), wrong
 
 
@@ -71,23 +108,23 @@ if __name__ == "__main__":
     parser.add_argument("--networks", type=int, default=40)
     arguments = parser.parse_args()
     found: dict[str, Any] = {}
-    for kind, machine, taxels in networks(arguments.networks):
+    for kind, netlist, votes, prove in networks(arguments.networks):
         row = found.setdefault(
             kind, {"networks": 0, "tried": 0, "wrong": 0, "proven": Counter(), "least": Counter()}
         )
         row["networks"] += 1
-        for one in sparse_events(row["networks"], 2, taxels, 2, STEPS, rate=0.25):
-            proof = certificate(machine, (one, 0, ""), shift=0, most=MOST, tally=tally_of(machine))
+        for one in sparse_events(row["networks"], 2, netlist.taxels, 2, STEPS, rate=0.25):
+            decision, at_least = prove(one)
             alters = 0
             for events in range(1, MOST + 1):
-                tried, wrong = altered(machine, one, events, proof.decision)
-                if events <= proof.at_least:
+                tried, wrong = altered(netlist, votes, one, events, decision)
+                if events <= at_least:
                     row["tried"] += tried
                     row["wrong"] += wrong
                 if wrong:
                     alters = events
                     break
-            row["proven"][str(proof.at_least)] += 1
+            row["proven"][str(at_least)] += 1
             row["least"][str(alters - 1 if alters else MOST)] += 1
     sums = {key: sum(row[key] for row in found.values()) for key in ("tried", "wrong")}
     arguments.output.write_text(json.dumps(made() | sums | {"by_kind": found}, indent=1) + "\n")

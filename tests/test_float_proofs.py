@@ -164,11 +164,11 @@ def test_single_events_are_decided_exactly():
         network = tied(small_network(seed, taxels=5))
         netlist = compile_network(network).netlist
         for one in sparse_events(seed, 6, 5, 2, 20, rate=0.2):
-            found = verdict(laid_out(network, 20), netlist, 1, one)
+            model = verdict(laid_out(network, 20), netlist, 1, one)
             channels = one.reshape(10, 20)
-            alters = np.any(decided(network, every_change(channels, 1)) != found.decision)
-            assert found.at_least == int(not alters)
-            shown.add((found.at_least, proven(network, channels, most=1)))
+            alters = np.any(decided(network, every_change(channels, 1)) != model.decision)
+            assert model.at_least == int(not alters)
+            shown.add((model.at_least, proven(network, channels, most=1)))
     assert shown == {(0, 0), (1, 0), (1, 1)}
 
 
@@ -179,16 +179,16 @@ def test_the_command(tmp_path, monkeypatch):
     as_json("compile", "net.pt", "-o", "net.loom")
     words = ["certify", "net.loom", "--data", "data", "--shift", "2", "--most", "3"]
     alone = as_json(*words)
-    found = as_json(*words, "--checkpoint", "net.pt")
-    assert found["provenance"]["checkpoint"] == "net.pt"
-    result = decode(Certificates, found)
-    both = [each["float"] for each in found["certificates"]]
+    beside = as_json(*words, "--checkpoint", "net.pt")
+    assert beside["provenance"]["checkpoint"] == "net.pt"
+    result = decode(Certificates, beside)
+    both = [each["float"] for each in beside["certificates"]]
     for each, model in zip(result.certificates, both, strict=True):
         alike = model["decision"] == each.decision
         assert each.alike == (min(each.at_least, model["at_least"]) if alike else None)
-    for each in found["certificates"]:
+    for each in beside["certificates"]:
         del each["float"]
-    assert found["certificates"] == alone["certificates"]
+    assert beside["certificates"] == alone["certificates"]
     out = run(*words, "--checkpoint", "net.pt")[1]
     assert "float model alike" in out
     assert "float model and chip decide alike: " in out

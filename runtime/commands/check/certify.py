@@ -36,6 +36,7 @@ KINDS = "; ".join(kind.what for kind in EXHAUSTIVE.values())
 NOTES = f"""\
 On each recording every change of these kinds is tried, none is sampled: {KINDS}.
 For several changed events it reports how many are proven to alter nothing, and how many are shown to suffice.
+--checkpoint also proves the float model's decision, in float32; certificates and their files are of the chip.
 """
 
 

@@ -35,8 +35,8 @@ def beside(
     prove = partial(verdict, laid_out(network, longest), netlist, certificates.most)
     lengths = data.step_counts.tolist()
     recordings = [events[..., :length] for events, length in zip(data.events, lengths, strict=True)]
-    found = in_threads(prove, recordings, "proving the float model", jobs)
-    both = zip(certificates.certificates, found, strict=True)
+    models = in_threads(prove, recordings, "proving the float model", jobs)
+    both = zip(certificates.certificates, models, strict=True)
     return replace(certificates, certificates=tuple(replace(one, model=model) for one, model in both))
 
 
