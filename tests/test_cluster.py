@@ -136,8 +136,8 @@ def test_commands_give_the_same_bytes(dask, tmp_path, monkeypatch):
 def test_points_of_a_lost_worker_are_done_elsewhere(dask, tmp_path):
     log = tmp_path / "log"
     made = points(log, 8, trouble={3: "die once"})
-    found = on(dask.address, lambda: dict(cluster.spread(enumerate(made), square)))
-    assert [found[index]["square"] for index in range(8)] == [n**2 for n in range(8)]
+    squares = on(dask.address, lambda: dict(cluster.spread(enumerate(made), square)))
+    assert [squares[index]["square"] for index in range(8)] == [n**2 for n in range(8)]
     assert begun(log).count(3) == 2
     assert sum(process.poll() is None for process in dask.workers) == 1
 
