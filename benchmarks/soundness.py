@@ -11,6 +11,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -78,7 +79,9 @@ def networks(count: int) -> Iterator[tuple[str, Netlist, Votes, Proof]]:
             network = expand(drawn, ring(2))
             netlist = compile_network(network).netlist
             yield "layers", netlist, *on_chip(machine_of(netlist))
-            yield "float model", netlist, *in_floats(network, netlist)
+            alpha = 0.5 * (seed % 2)  # currents last in every other
+            populations = tuple(replace(each, alpha=alpha) for each in network.populations)
+            yield "float model", netlist, *in_floats(replace(network, populations=populations), netlist)
         else:
             counters = random_counters(seed, taxels=2, classes=3)
             netlist = compile_network(counting_network(counters)).netlist

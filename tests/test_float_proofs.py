@@ -14,7 +14,7 @@ from random_networks import chain, float_networks, random_checkpoint, ring, stor
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.interpret import float_simulation
-from spikeloom.compiler.ir import Projection
+from spikeloom.compiler.ir import INPUT, Input, Network, Population, Projection, Readout
 from spikeloom.compiler.passes.expand import expand
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.runtime.machines.bounds.floats import laid_out
@@ -150,11 +150,79 @@ def test_no_past_and_no_future_make_a_group_turn_more_votes_than_its_bound(kind)
     assert tight > 20
 
 
-def test_a_network_without_bounds_is_refused():
+def voters(weight, **registers):
+    """A layer that votes, its first neuron for class 1, its second for class 0."""
+    weight = np.array(weight)
+    return Network(
+        input=Input(taxels=weight.shape[1], polarities=1),
+        populations=(Population(name="votes", bias=np.zeros(2), **registers),),
+        projections=(Projection(pre=INPUT, post=0, weight=stored(weight, weight != 0)),),
+        readout=Readout(population=0, label=np.array([1, 0])),
+        classes=2,
+    )
+
+
+def test_a_current_that_lasts_is_seen_behind_a_membrane_that_does_not():
+    """A spike more clears the membrane, below the known one; what caused it comes back from the current."""
+    network = voters([[0.45, 0.6, 0.0], [0.0, 0.0, 0.9]], beta=0.0, theta=0.5, alpha=0.5)
+    channels = np.array([[1, 0, 0], [0, 0, 0], [1, 0, 0]], np.uint8)
+    assert not np.all(decided(network, every_change(channels, 1)) == decided(network, channels[None]))
+    assert proven(network, channels) == 0
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.5, 1.0])
+def test_layers_whose_currents_last_and_that_vote(beta):
+    rng = np.random.default_rng(7)
+    shown = set()
+    for _ in range(60):
+        weight = np.round(rng.normal(0, 0.5, (2, 3)), 1)
+        network = voters(weight, beta=beta, theta=0.5, alpha=float(rng.choice([0.5, 0.95])))
+        channels = sparse_events(rng, 3, 20, rate=0.3)  # beyond the step in which small numbers are flushed
+        altered = np.any(decided(network, every_change(channels, 1)) != decided(network, channels[None]))
+        bound = proven(network, channels)
+        assert not (bound and altered)
+        shown.add(bool(bound))
+    assert shown == {False, True}
+
+
+def test_what_a_current_rounds_comes_back_as_often_as_it_lasts():
+    """Held just below 2, a current adds pairs that cancel; an event lifts it above, where each of them is rounded."""
+    alpha, steps, pairs, ulp = np.float32(0.99), 200, 200, 2.0**-23
+    charge = 0.050633639097213745  # with which 50 steps end a little below 2
+    weight = np.array([[16 * ulp, charge, 0.0, *[1.001 * ulp, -0.999 * ulp] * pairs]]).repeat(2, axis=0)
+    weight[1] = 0
+    channels = np.zeros((weight.shape[1], steps), np.uint8)
+    channels[1, :50] = 1
+    channels[2:, 50:] = 1
+    current = np.float32(0)
+    for _ in range(50):
+        current = current * alpha + np.float32(charge)
+    weight[0, 2] = float(current) - float(current * alpha)
+    changed = channels.copy()
+    changed[0, 51] = 1
+
+    def highest(runs, theta):
+        network = voters(weight, beta=0.99, theta=theta, alpha=0.99)
+        run = float_simulation(network, np.float32).run(runs.transpose(0, 2, 1) != 0, membranes=True)
+        return network, run.membranes[0][..., 0].max(axis=1)
+
+    low, high = highest(np.stack([channels, changed]), 1e6)[1]
+    assert high > low
+    network, _ = highest(channels[None], float(low + 0.75 * (high - low)))
+    model = laid_out(network, steps)
+    _, groups = model.groups(channels, (1, steps, 2), REACH)
+    assert not np.array_equal(*votes_of(network, np.stack([channels, changed])).sum(axis=1))
+    assert groups.after(Past(52), 51)[0, -1, 1] >= 1
+
+
+def test_networks_without_bounds_are_refused():
     network = chain([[1.0, 0.5]], [[1.0]], [[1.0]])
     skips = Projection(pre=0, post=2, weight=stored([[0.5]]))
     with pytest.raises(OptionError, match=r"fc3 receives from layers of several depths.* omit it"):
         laid_out(replace(network, projections=(*network.projections, skips)), 9)
+    for large in (3e38, 1e300):
+        with pytest.raises(OptionError, match=r"may exceed float32.* omit it"):
+            laid_out(voters([[large, large, -large], [0, 0, 0]], beta=0.0, theta=0.5), 1)
 
 
 def test_single_events_are_decided_exactly():

@@ -26,7 +26,7 @@ from spikeloom.runtime.studies.cluster import on_cluster
 from spikeloom.runtime.studies.robustness.certificate_file import write_certificate
 from spikeloom.runtime.studies.robustness.certify_sections import sections, taxel_map
 from spikeloom.runtime.studies.robustness.exhaustive import certify, expected_seconds
-from spikeloom.runtime.studies.robustness.float_proof import beside
+from spikeloom.runtime.studies.robustness.float_proof import beside, prepared
 from spikeloom.runtime.studies.robustness.perturbations import EXHAUSTIVE
 from spikeloom.runtime.studies.robustness.provenance import compared
 from spikeloom.runtime.studies.robustness.results import Provenance
@@ -56,6 +56,7 @@ def run(request: CertifyRequest) -> Outcome:
     machine = machine_for(request.netlist)
     loaded = _float_network(request, machine)
     data = load_recordings(request.data, request, machine.netlist, labels_for="certify", joined=False)
+    model = None if loaded is None else prepared(loaded.network, machine.netlist, data)
     singles = int(data.step_counts.sum()) * data.taxels * data.events.shape[2]
     seconds = expected_seconds(machine, data, request.jobs)
     lasting = "" if seconds is None or seconds < TOLD_S else f", at most about {seconds / 60:,.0f} min"
@@ -64,8 +65,8 @@ def run(request: CertifyRequest) -> Outcome:
     )
     certificates = certify(machine, data, shift=request.shift, most=request.most, jobs=request.jobs)
     provenance = Provenance.of(request, data.sha256)
-    if loaded is not None:
-        certificates = beside(certificates, loaded.network, machine.netlist, data, jobs=request.jobs)
+    if loaded is not None and model is not None:
+        certificates = beside(certificates, model, machine.netlist, data, jobs=request.jobs)
         provenance = compared(request, data.sha256, loaded)
     places = places_of(None, machine.netlist.provenance, data.taxels)
     result = replace(certificates, provenance=provenance, places=places)

@@ -62,7 +62,7 @@ class KnownRun(Protocol):
 
     @property
     def current(self) -> AnyArray:
-        """Registers before each step, and after the last, (steps + 1, places)."""
+        """Registers before each step, and after the last, (steps + 1, places); zero where differences are held."""
 
     @property
     def membrane(self) -> AnyArray:
@@ -97,7 +97,7 @@ def implements(question: Callable[..., Any], kind: type) -> Callable[[F], F]:
 
 
 def surely(chip: Any, work: Any, sign: Any, first: Any, begin: Any, length: Any) -> None:
-    """Add weights of a source that spikes otherwise to the least and largest sums from place `first` on."""
+    """Add weights of a source that spikes otherwise for sure to the least and largest sums, from place `first` on."""
     raise NotImplementedError
 
 

@@ -44,7 +44,9 @@ class Work(NamedTuple):
     # listed, kind: int64; sources whose spikes differ for sure (1 and -1), or may (2 and -2), by coming or going
     listed: IntArray
     kind: IntArray
-    codes: AnyArray  # (places,) uint8; 3 for a sure spike, 2 for an open one
+    codes: (
+        AnyArray  # (places,) uint8; 3 for a sure spike, 2 for an open one; of a block, while it is stepped
+    )
     arrived: (
         IntArray  # (2,) int64; how many spikes arrived last that differ, or may, and how many that differ
     )

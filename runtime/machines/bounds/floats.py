@@ -2,7 +2,7 @@
 
 Registers are held as what they differ by from the known run's, in float64, and bounds are widened in each step by what
 both runs may round: n float32 summed in any order are off by less than n / 2**24 of the sum of their magnitudes. A
-neuron that nothing has reached computes the same numbers, and is not widened. Layers lag as on the chip.
+neuron that nothing has reached is not widened: it adds the same numbers in the same order. Layers lag as on the chip.
 """
 
 from __future__ import annotations
@@ -33,13 +33,15 @@ from spikeloom.runtime.machines.changes import Groups
 from spikeloom.runtime.machines.votes import readout_counts
 
 ROUNDING = 1.01 * 2.0**-23
-"""What two float32 operations, one in each run, are off by; float64 is off by less than the hundredth here."""
+"""Share of a float32 result by which it may differ in two runs; the hundredth covers what float64 rounds here."""
 
 BLUR = 1e-12
-"""So much is each weight widened: two that cancel may still be rounded, and are not taken for none."""
+"""Share of a weight by which it is widened: where two cancel, the sum is still a rounded one, and no zero."""
 
 FLUSHED = 1e-29
 """More than a register loses where it is nearly zero."""
+
+LARGEST = float(np.finfo(np.float32).max)
 
 
 class Floats(NamedTuple):
@@ -57,10 +59,10 @@ class Floats(NamedTuple):
     # current, membrane: what none exceeds in magnitude
     current: FloatArray
     membrane: FloatArray
-    # widest, total, sources: magnitude of the largest weight and of all together, and how many there are
-    widest: FloatArray
-    total: FloatArray
-    sources: FloatArray
+    lasting: FloatArray  # What a current adds up to in a membrane without decay, as a multiple
+    widest: FloatArray  # Magnitude of the largest weight
+    total: FloatArray  # Magnitudes of all weights together
+    sources: FloatArray  # Number of weights
     rounding: FloatArray  # What two runs may round otherwise in a step, beside their sums
     label: AnyArray  # (places,) int32
 
@@ -83,6 +85,7 @@ class FloatNetwork:
     """A float network ready for bounds, of recordings up to a length."""
 
     network: Network
+    steps: int  # Of the longest recording
     simulation: Simulation
     floats: Floats
     magnitude: sparse.csr_array  # (places, sources); of weights
@@ -92,6 +95,7 @@ class FloatNetwork:
     def known_run(self, channels: EventArray) -> Known:
         """Run a recording (channels, T) and keep what changed runs need."""
         length = channels.shape[1]
+        assert length <= self.steps, "laid out for shorter recordings"
         places = len(self.floats.bias)
         depth = depths(self.network)
         steps = length + max(depth)
@@ -136,7 +140,8 @@ class FloatNetwork:
 def laid_out(network: Network, steps: int) -> FloatNetwork:
     """Lay a network out for recordings of up to so many steps.
 
-    Raises OptionError for a network whose layers receive from layers that do not come just before them.
+    Raises OptionError for a network whose layers receive from layers that do not come just before them, or whose
+    registers might overflow.
     """
     depth = np.array(depths(network))
     for each in network.projections:
@@ -153,9 +158,11 @@ def laid_out(network: Network, steps: int) -> FloatNetwork:
     layer = np.repeat(np.arange(len(blocks)), blocks)
     weight, feeds = _wiring(network, place, LANES * len(layer))
     magnitude = abs(weight)
+    registers = _registers(network, place, magnitude, steps)
     within = [each for each in network.projections if each.pre != INPUT]
     return FloatNetwork(
         network=network,
+        steps=steps,
         simulation=float_simulation(network, np.float32),
         floats=Floats(
             synapses=by_source([weight], np.float64),
@@ -163,7 +170,7 @@ def laid_out(network: Network, steps: int) -> FloatNetwork:
             depth=depth[layer],
             outer=~np.isin(layer, [each.post for each in within]),
             ordered=all(each.pre < each.post for each in within),
-            **_registers(network, place, magnitude, steps),
+            **registers,
         ),
         magnitude=magnitude,
         feeds=feeds[layer].astype(np.float64),
@@ -183,7 +190,9 @@ def _wiring(
         for pre, weight in added_up(into).items():
             source = np.arange(inputs) if pre == INPUT else inputs + place[pre]
             entries = weight.tocoo()
-            parts.append((entries.data.astype(np.float32), place[post][entries.row], source[entries.col]))
+            with np.errstate(over="ignore"):  # what is infinite is refused with all that might become so
+                stored = entries.data.astype(np.float32)
+            parts.append((stored, place[post][entries.row], source[entries.col]))
             feeds[post, source] = True
     data, row, column = (np.concatenate(each) for each in zip(*parts, strict=True))
     shape = places, inputs + places
@@ -194,21 +203,36 @@ def _registers(
     network: Network, place: tuple[IntArray, ...], magnitude: sparse.csr_array, steps: int
 ) -> dict[str, AnyArray]:
     """What :class:`Floats` holds of each place, from the magnitudes of weights."""
-    laid = {name: np.zeros(magnitude.shape[0]) for name in ("alpha", "beta", "threshold", "bias")}
-    laid["threshold"][:] = np.inf
+    places, inputs = magnitude.shape
+    alpha, beta, bias = np.zeros((3, places))
+    threshold = np.full(places, np.inf)
     for population, at in zip(network.populations, place, strict=True):
-        of_each = population.alpha, population.beta, population.theta, population.bias
-        for values, value in zip(laid.values(), of_each, strict=True):
-            values[at] = np.asarray(value, np.float32)
-    label = np.full(magnitude.shape[0], -1, np.int32)
+        alpha[at] = np.float32(population.alpha)
+        beta[at] = np.float32(population.beta)
+        bias[at] = population.bias.astype(np.float32)
+        threshold[at] = np.float32(population.theta)
+    label = np.full(places, -1, np.int32)
     label[place[network.readout.population]] = network.readout.label
     total = magnitude.sum(axis=1)
-    current, membrane = _magnitudes(total, **laid, steps=steps)
-    operations = (1 + laid["alpha"]) * current + 2 * membrane + abs(laid["bias"])
-    return laid | {
+    lasting = 1 / np.maximum(1 - alpha, 1e-9)
+    rounded = 1 + 2.0**-22 * (inputs + steps)
+    current = rounded * total * np.minimum(lasting, steps)
+    sinking = (current + abs(bias)) * np.minimum(1 / np.maximum(1 - beta, 1e-9), steps)
+    membrane = rounded * (np.where(np.isfinite(threshold), abs(threshold), 0) + sinking)
+    operations = (1 + alpha) * current + 2 * membrane + abs(bias)
+    if not np.all(2 * operations < LARGEST):  # NaN, too
+        raise OptionError(
+            "--checkpoint: sums of the network may exceed float32, for which there are no bounds; omit it"
+        )
+    return {
+        "alpha": alpha,
+        "beta": beta,
+        "threshold": threshold,
+        "bias": bias,
         "current": current,
         "membrane": membrane,
         "rounding": FLUSHED + ROUNDING * operations,
+        "lasting": lasting,
         "widest": magnitude.max(axis=1).toarray().ravel(),
         "total": total,
         "sources": np.diff(magnitude.indptr).astype(np.float64),
@@ -216,26 +240,11 @@ def _registers(
     }
 
 
-def _magnitudes(
-    sums: FloatArray,
-    alpha: FloatArray,
-    beta: FloatArray,
-    threshold: FloatArray,
-    bias: FloatArray,
-    steps: int,
-) -> tuple[FloatArray, FloatArray]:
-    """What no current and no membrane of any run exceeds, float32 roundings included."""
-    kept = np.minimum(1 / np.maximum(1 - alpha, 1e-9), steps)
-    current = 1.001 * sums * kept
-    sinking = (current + abs(bias)) * np.minimum(1 / np.maximum(1 - beta, 1e-9), steps)
-    finite = np.where(np.isfinite(threshold), abs(threshold), 0)
-    return current, 1.001 * (finite + sinking)
-
-
 def safe(floats: Floats, known: Known) -> Safe:
     """Differences of membranes before each step, (steps + 1, places), from which every later spike is the known one.
 
-    Where currents last, they outlive resets: a difference then has to be safe in all later steps, decayed or not.
+    Of a current that lasts it is assumed that membranes do not decay and that no reset clears them: a difference is
+    safe if it is in all later steps, together with all that the current still adds and all that both runs round.
     """
     steps, places = known.fired.shape
     length = known.events.shape[1]
@@ -250,7 +259,7 @@ def safe(floats: Floats, known: Known) -> Safe:
         least = np.where(fired, np.where(lasts, np.maximum(gap, after[0]), gap), after[0])
         most = np.where(fired, np.where(lasts, after[1], np.inf), np.minimum(gap, after[1]))
         arrived = floats.alpha * floats.current + known.sums[t]
-        slack = floats.rounding + ROUNDING * np.repeat(known.active[t], LANES) * arrived
+        slack = floats.lasting * (floats.rounding + ROUNDING * np.repeat(known.active[t], LANES) * arrived)
         inside = (depth <= t) & (t < depth + length) & (kept > 0)  # else what is stored is lost in this step
         for bound, end, sign in ((bounds.low, least, -1), (bounds.high, most, 1)):
             room = sign * end - slack
@@ -277,7 +286,7 @@ def _surely(floats: Floats, work: Any, sign: Any, first: Any, begin: Any, length
 
 @compiled
 def _reached(codes: Any, low: Any, high: Any, alpha: Any, box: Any, first: Any) -> None:
-    """Mark neurons that may not compute the known numbers in a step."""
+    """Mark neurons that may not compute the known numbers in a step, where their codes will be."""
     low_u, high_u, low_v, high_v = box
     for i in range(first, first + np.uint64(LANES)):
         arrives = np.uint8(low[i] != 0) | np.uint8(high[i] != 0)
@@ -290,7 +299,7 @@ def _reached(codes: Any, low: Any, high: Any, alpha: Any, box: Any, first: Any) 
 def _loosen(
     floats: Floats, low: Any, high: Any, reached: Any, sums: Any, active: Any, arrived: Any, first: Any
 ) -> None:
-    """Widen sums by what two runs may round otherwise, one of which has spikes that the other may not have."""
+    """Widen the sums of neurons that are reached by what the known run and this one may round otherwise."""
     spikes = np.float64(arrived[0]) + active
     sure = np.float64(arrived[1])
     for i in range(first, first + np.uint64(LANES)):
@@ -388,10 +397,11 @@ def _unknown(floats: Floats, known: Known, start: Any, work: Any) -> Any:
 def _unsafe(floats: Floats, _known: Known, bounds: Safe, box: Any, t: Any, block: Any) -> Any:
     low_u, high_u, low_v, high_v = box
     for i in range(block * LANES, (block + 1) * LANES):
-        alpha = floats.alpha[i]
-        lasting = alpha * max(abs(low_u[i]), abs(high_u[i]))
-        if lasting != 0 or low_v[i] != 0 or high_v[i] != 0:
-            later = lasting / max(1 - alpha, 1e-9)
-            if low_v[i] - later < bounds.low[t, i] or high_v[i] + later > bounds.high[t, i]:
+        later = floats.alpha[i] * max(abs(low_u[i]), abs(high_u[i])) * floats.lasting[i]
+        if later != 0 or low_v[i] != 0 or high_v[i] != 0:
+            lasts = floats.alpha[i] != 0  # longer than the membrane, which may make up for it now
+            least = min(low_v[i], 0.0) if lasts else low_v[i]
+            most = max(high_v[i], 0.0) if lasts else high_v[i]
+            if least - later < bounds.low[t, i] or most + later > bounds.high[t, i]:
                 return True
     return False

@@ -156,7 +156,7 @@ def _follow(
     lost: Any,
 ) -> Any:
     """Run on from a step, whose sums have what its group adds; notes votes that are lost; whether the run ended."""
-    steps = len(known.sums)
+    steps = len(known.fired)
     reach = len(lost)
     gone = 0
     clear(work.turned)

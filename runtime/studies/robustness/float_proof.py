@@ -22,19 +22,28 @@ if TYPE_CHECKING:
     from spikeloom.runtime.machines.bounds.floats import FloatNetwork
 
 
-def beside(
-    certificates: Certificates, network: Network, netlist: Netlist, data: Recordings, *, jobs: int | None
-) -> Certificates:
-    """Certificates of these recordings with what is proven of the float network that the netlist was made of.
+def prepared(network: Network, netlist: Netlist, data: Recordings) -> FloatNetwork:
+    """The float network that a netlist was made of, ready for these recordings.
 
     Raises OptionError for a network that has no bounds: see :func:`floats.laid_out`.
     """
     from spikeloom.runtime.machines.bounds.floats import laid_out
 
-    longest = max(int(data.step_counts.max()), netlist.clocks.length or 0)
-    prove = partial(verdict, laid_out(network, longest), netlist, certificates.most)
+    return laid_out(network, max(int(data.step_counts.max()), netlist.clocks.length or 0))
+
+
+def beside(
+    certificates: Certificates,
+    network: FloatNetwork,
+    netlist: Netlist,
+    data: Recordings,
+    *,
+    jobs: int | None,
+) -> Certificates:
+    """Certificates of these recordings with what is proven of the float network."""
     lengths = data.step_counts.tolist()
     recordings = [events[..., :length] for events, length in zip(data.events, lengths, strict=True)]
+    prove = partial(verdict, network, netlist, certificates.most)
     models = in_threads(prove, recordings, "proving the float model", jobs)
     both = zip(certificates.certificates, models, strict=True)
     return replace(certificates, certificates=tuple(replace(one, model=model) for one, model in both))

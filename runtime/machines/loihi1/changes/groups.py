@@ -8,7 +8,7 @@ import numpy as np
 
 from spikeloom.compiler.layer_kernel import charged, compiled, saturated
 from spikeloom.compiler.targets.loihi1.registers import CURRENT_MAX, MEMBRANE_SHIFT
-from spikeloom.runtime.machines.bounds import groups as bounds
+from spikeloom.runtime.machines.bounds import groups as search
 from spikeloom.runtime.machines.bounds.arithmetic import (
     LANES,
     Safe,
@@ -28,7 +28,7 @@ from spikeloom.runtime.machines.loihi1.changes.safe import unsafe as unsafe_memb
 
 def groups(chip: Chip, known: Known, shape: tuple[int, int, int], decision: int, reach: int) -> Groups:
     """Bound what groups of events turn; `shape` are channels and steps in which events may change, and classes."""
-    return bounds.groups(chip, known, safe(chip, known), shape, decision, reach)
+    return search.groups(chip, known, safe(chip, known), shape, decision, reach)
 
 
 # Each loop is a function of its own that writes one array: only so does the compiler vectorise it.
