@@ -61,8 +61,8 @@ REQUEST = Request
 
 def run(_request: Request) -> Outcome:
     """Run the command; exit code 1 where something does not work."""
-    found = Diagnosis(checks=(*_machine(), *_libraries(), *_folders(), _kernels(), *_shipped()))
-    return Outcome(found, sections, 1 if found.wrong else 0)
+    diagnosis = Diagnosis(checks=(*_machine(), *_libraries(), *_folders(), _kernels(), *_shipped()))
+    return Outcome(diagnosis, sections, 1 if diagnosis.wrong else 0)
 
 
 def sections(found: Diagnosis) -> Iterator[Section]:
