@@ -201,4 +201,4 @@ def test_proofs_stand_against_all_inputs_of_random_networks(tmp_path, monkeypatc
     found = json.loads((tmp_path / "found.json").read_text())
     assert found["tried"] > 1000
     assert found["wrong"] == 0
-    assert set(found["by_kind"]) == {"counters", "layers"}
+    assert set(found["by_kind"]) == {"counters", "float model", "layers"}
