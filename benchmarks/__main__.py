@@ -86,11 +86,16 @@ def flat(folders: dict[str, dict[str, str]]) -> dict[str, str]:
     return {str(Path(folder, file)): at for folder, files in folders.items() for file, at in files.items()}
 
 
-def depends(log: Path, place: Path) -> dict[str, dict[str, str]]:
-    """Digests of the files of the repository that are in a log, by folder; `place` holds the copy of this folder."""
+def depends(log: Path, place: Path, began: int) -> dict[str, dict[str, str]]:
+    """Digests of the files of the repository that are in a log, by folder; `place` holds the copy of this folder.
+
+    Not of what was written there since the run began, ns.
+    """
     found = set()
     for line in set(log.read_text("utf-8").splitlines()):
         path = Path(source_from_cache(line) if line.endswith(".pyc") else line)
+        if path.is_relative_to(place) and path.exists() and path.stat().st_mtime_ns >= began:
+            continue
         path = ROOT / path.relative_to(place) if path.is_relative_to(place) else path.resolve()
         if path.is_relative_to(ROOT) and path.suffix != ".md":
             found.add(str(path.relative_to(ROOT)))
@@ -118,14 +123,14 @@ def run(name: str, place: Path, sources: list[Path]) -> dict[str, Any]:
     start = [sys.executable, *(["-m", program, *words, "--json"] if program == "spikeloom" else words)]
     paths = os.pathsep.join(map(str, (HERE / "traced", ROOT / "src")))
     environment = os.environ | {"PYTHONPATH": paths, "SPIKELOOM_TRACE": str(place / "log")}
-    begun = time.perf_counter()
+    began, begun = time.time_ns(), time.perf_counter()
     done = subprocess.run(start, cwd=place, env=environment, capture_output=True, text=True, check=False)
     seconds = time.perf_counter() - begun
     if program == "spikeloom":
         (results / name).write_text(done.stdout, "utf-8")
     if done.returncode not in (0, 1) or not (results / name).exists():
         raise RuntimeError(f"exit code {done.returncode}\n{done.stderr[-2000:]}")
-    return {"seconds": round(seconds, 1), "files": depends(place / "log", place)}
+    return {"seconds": round(seconds, 1), "files": depends(place / "log", place, began)}
 
 
 def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:

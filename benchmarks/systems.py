@@ -1,6 +1,6 @@
 """Accuracy against energy of what ``smallest`` chose and of released recipes: the figure that README leads with.
 
-    python benchmarks/systems.py
+    python benchmarks/systems.py [FOLDER]
 
 Draws ``results/systems.png`` from stored results alone, and chooses nothing: each ``smallest-*.json`` (its choice, on
 the recordings that its digest names), the choices of ``unseen.json``, one with each condition left out, the shipped
@@ -24,7 +24,6 @@ import matplotlib.pyplot as plt
 from spikeloom.runtime.report.numbers import wilson
 
 RESULTS = Path(__file__).parent / "results"
-PICTURE = RESULTS / "systems.png"
 TABLES = ("davies2018", "sanafe")
 SHIPPED = {
     "Objects": {"objects": "20 ms", "objects-200ms": "200 ms"},
@@ -151,7 +150,7 @@ def crowded(one: dict[str, Any], others: list[dict[str, Any]]) -> bool:
     )
 
 
-def draw(picture: Path) -> None:
+def draw(folder: Path) -> Iterator[Path]:
     """One panel for each set of recordings, small labels beside each mark."""
     figure, panels = plt.subplots(len(SHIPPED), figsize=(5.2, 8.4), layout="constrained", sharex=True)
     used: dict[str, tuple[str, str]] = {}
@@ -182,8 +181,9 @@ def draw(picture: Path) -> None:
     figure.supylabel("test accuracy (%), chip", fontsize=10)
     handles = [plt.Line2D([], [], color=c, marker=m, ls="", label=name) for name, (m, c) in used.items()]
     panels[0].legend(handles=handles, fontsize=8, loc="lower left")
-    figure.savefig(picture, dpi=130, metadata={"Description": f"drawn from {sources()}"})
+    figure.savefig(folder / "systems.png", dpi=130, metadata={"Description": f"drawn from {sources()}"})
+    yield folder / "systems.png"
 
 
 if __name__ == "__main__":
-    draw(Path(sys.argv[1]) if sys.argv[1:] else PICTURE)
+    list(draw(Path(sys.argv[1]) if sys.argv[1:] else RESULTS))

@@ -5,6 +5,7 @@ import json
 import re
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -136,15 +137,16 @@ def test_sessions_print_what_the_docs_show(claims, page):
             assert re.fullmatch(lines, printed), command
 
 
-def test_the_picture_of_the_readme_is_drawn_from_what_is_stored(tmp_path):
+def test_pictures_are_drawn_from_what_is_stored(tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "benchmarks"))
-        systems = importlib.import_module("systems")
-    assert f"drawn from {systems.sources()}".encode() in systems.PICTURE.read_bytes()
-    systems.draw(tmp_path / "again.png")
-    again, before = (systems.plt.imread(file) for file in (tmp_path / "again.png", systems.PICTURE))
-    assert again.shape == before.shape
-    assert np.abs(again - before).mean() < 0.01  # the edges of letters may differ
+        drawing = [importlib.import_module(name) for name in ("systems", "counting")]
+    for picture in [each for script in drawing for each in script.draw(tmp_path)]:
+        stored = RESULTS / picture.name
+        assert re.search(rb"drawn from \w{64}", picture.read_bytes())[0] in stored.read_bytes()
+        again, before = (plt.imread(file) for file in (picture, stored))
+        assert again.shape == before.shape
+        assert np.abs(again - before).mean() < 0.01  # the edges of letters may differ
 
 
 def results():

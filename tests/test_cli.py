@@ -408,3 +408,25 @@ def test_a_rung_that_is_proven_is_what_it_would_be(as_json, monkeypatch):
     monkeypatch.setattr(reference, "prove_ranges", lambda network: asked.append(network) or unproven)
     assert as_json(*VERIFYING, codes=(0, 1))["ladder"] == proven
     assert asked
+
+
+def test_exit_codes_are_those_of_the_docs(spikeloom, as_json, tmp_path):
+    assert as_json(*VERIFYING, "--require", "E2=1", codes=(1,))["missed"]
+    chart = (
+        "chart",
+        "net.pt",
+        "--data",
+        "data",
+        "--jobs",
+        "1",
+        "--grid",
+        "bits=8",
+        "-o",
+        tmp_path / "chart",
+    )
+    assert as_json(*chart, "--budget", "energy=1nJ", codes=(1,))["points"]
+    code, _, err = spikeloom("compile", "net.pt", "--target", "truenorth", "-o", tmp_path / "x.loom")
+    *rules, _ = err.splitlines()
+    assert code == 2
+    assert len(rules) > 1
+    assert all("(truenorth." in line for line in rules)

@@ -11,7 +11,7 @@ from oracles import refused
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.models.recordings.grasps import synthetic_split
-from spikeloom.models.training import record
+from spikeloom.models.training import folds, record
 from spikeloom.models.training.counters import Plan, counters_of, fit, run_counters
 from spikeloom.runtime.commands.choose import smallest
 from spikeloom.runtime.commands.options import request_of
@@ -216,6 +216,7 @@ def few(monkeypatch, tmp_path):
     monkeypatch.setattr(space, "SIZES", ())
     monkeypatch.setattr(baselines, "PARTS", (1,))
     monkeypatch.setattr(work, "ROUNDS", 2)
+    monkeypatch.setattr(folds, "FOLDS", 2)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
