@@ -2,9 +2,9 @@
 
     python benchmarks/counting.py [FOLDER]
 
-Draws ``counting-fewer.png`` from ``fewer-objects.json`` and ``fewer-containers.json``, ``counting-stress.png`` from
-``stress-counters.json`` and ``stress-objects.json``: accuracy on the chip, mean over seeds. Both hold the digest of what
-was drawn; the tests draw them again and compare.
+Draws ``counting-fewer.png`` from ``fewer-objects.json`` and ``fewer-containers.json``, and ``counting-stress.png``
+from ``stress-counters.json`` and ``stress-objects.json``: accuracy on the chip, mean over seeds. Both hold the digest
+of what was drawn; the tests draw them again and compare.
 """
 
 from __future__ import annotations

@@ -181,6 +181,16 @@ def test_results_come_out_again(stored, name):
     assert stored.again(name) == []
 
 
+def test_what_a_run_wrote_is_none_of_its_sources(stored, tmp_path):
+    (tmp_path / "benchmarks").mkdir()
+    file = tmp_path / "benchmarks" / "made.py"
+    shutil.copyfile(stored.HERE / "made.py", file)
+    (tmp_path / "log").write_text(f"{file}\n")
+    written = file.stat().st_mtime_ns
+    assert stored.depends(tmp_path / "log", tmp_path, written) == {}
+    assert list(stored.depends(tmp_path / "log", tmp_path, written + 1)["benchmarks"]) == ["made.py"]
+
+
 def test_a_result_that_was_edited_differs_and_its_record_is_written(stored):
     name = "longer-bins.json"
     file = stored.RESULTS / name
