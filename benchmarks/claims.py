@@ -9,8 +9,8 @@ with it; ``file.json:path`` is of another result. A path takes ``*`` for every e
 ``key=value,key=value`` for that of a list. Before a format ``mean``, ``max``, ``range`` and ``count`` (of what is true)
 are of a list; ``spread`` is mean (interval).
 
-A sentence with a number or a comparison must be bound: to a result (``claims``; `holds` are comparisons that must be
-true of it), to a test that fails where it is false (``proofs``), or to a file whose numbers it repeats
+A sentence with a number, a comparison or a refusal must be bound: to a result (``claims``; `holds` are comparisons that
+must be true of it), to a test that fails where it is false (``proofs``), or to a file whose numbers it repeats
 (``definitions``). Every result has its digest in ``results/SHA256SUMS``.
 """
 
@@ -65,6 +65,7 @@ REFUSED = re.compile(r"\bexit codes?\b|\brefuse[sd]?\b|\bis assumed\b", re.IGNOR
 """What the program does where something is wrong or open; it needs a test."""
 
 PICTURE = re.compile(r"!\[[^\]]*\]\((?:[^()]*/)?([^()/]+)\)")
+"""Name of a picture on a page; each is shown once."""
 
 RELATIONS = {"<": operator.lt, "<=": operator.le, "==": operator.eq, ">": operator.gt, ">=": operator.ge}
 
@@ -279,7 +280,7 @@ class Tree:
         known = [found.span() for said in self._said(page) for found in re.finditer(re.escape(said), text)]
         known += [found.span() for found in CODE.finditer(text) if not FIGURE.fullmatch(found[1] or "")]
         places = {place for span in known for place in range(*span)}
-        for pattern in (NUMBER, COMPARED, *(() if page in RECORDS else (REFUSED,))):
+        for pattern in (NUMBER, COMPARED) if page in RECORDS else (NUMBER, COMPARED, REFUSED):
             for found in pattern.finditer(text):
                 if not places.issuperset(range(*found.span())):
                     yield f"{page}: nothing stands behind: …{text[max(0, found.start() - 60) : found.end() + 20]}…"

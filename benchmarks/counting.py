@@ -3,8 +3,8 @@
     python benchmarks/counting.py [FOLDER]
 
 Draws ``counting-fewer.png`` from ``fewer-objects.json`` and ``fewer-containers.json``, and ``counting-stress.png``
-from ``stress-counters.json`` and ``stress-objects.json``: accuracy on the chip, mean over seeds. Both hold the digest
-of what was drawn; the tests draw them again and compare.
+from ``stress-counters.json`` and ``stress-objects.json``, means over seeds. Both hold the digest of what was drawn; the
+tests draw them again and compare.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import hashlib
 import json
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +26,9 @@ STYLES = ({"marker": "o", "color": "#0072b2"}, {"marker": "s", "color": "#e69f00
 """Of the first and the second thing that a panel compares; they can be told apart without colours."""
 
 NETWORKS = {"counting network": "stress-counters.json", "TactileSGNet": "stress-objects.json"}
-WINDOWS = {"whole recordings": "100", "first half": "50"}
-POINT = re.compile(r"(\d+) taxels, (\d+) %")
+WINDOWS = {"100": "whole recordings", "50": "first half"}
+"""Parts of a recording, in %."""
+
 COLUMNS = 6
 
 
@@ -38,31 +38,30 @@ def stored(name: str) -> Any:
 
 def fewer() -> dict[str, Any]:
     """By recordings and part of a recording: taxels, accuracy in nested cross-validation and its interval, test."""
-    found: dict[str, Any] = {}
-    for name in ("Objects", "Containers"):
+    found: dict[str, Any] = {
+        name: {words: [] for words in WINDOWS.values()} for name in ("Objects", "Containers")
+    }
+    for name, lines in found.items():
         result = stored(f"fewer-{name.lower()}.json")
-        points = {POINT.fullmatch(point): each for point, each in result["points"].items()}
-        found[name] = {
-            words: [
-                (int(point[1]), *each["accuracy"], each["test_correct"] / result["test_samples"])
-                for point, each in points.items()
-                if point is not None and point[2] == window
-            ]
-            for words, window in WINDOWS.items()
-        }
+        for point, each in result["points"].items():
+            taxels, window = re.findall(r"\d+", point)
+            if window in WINDOWS:
+                test = each["test_correct"] / result["test_samples"]
+                lines[WINDOWS[window]].append((int(taxels), *each["accuracy"], test))
     return found
 
 
 def stress() -> dict[str, Any]:
     """By perturbation and network: levels, and accuracy on the chip at each."""
     figures = {name: stored(file)["figures"] for name, file in NETWORKS.items()}
-    found: dict[str, Any] = {}
-    for name, each in figures.items():
-        for kind, curve in each.items():
-            if kind != "clean":
-                levels = {level: point["chip"] for level, point in curve["levels"].items()}
-                found.setdefault(kind, {})[name] = levels
-    return found
+    return {
+        kind: {
+            name: {level: point["chip"] for level, point in each[kind]["levels"].items()}
+            for name, each in figures.items()
+        }
+        for kind in figures["TactileSGNet"]
+        if kind != "clean"
+    }
 
 
 def draw_fewer(found: dict[str, Any]) -> plt.Figure:
@@ -110,16 +109,15 @@ def sources(found: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(found).encode()).hexdigest()
 
 
-def draw(folder: Path) -> Iterator[Path]:
+def draw(folder: Path) -> list[Path]:
     """Both pictures."""
     for name, (what, figure) in PICTURES.items():
         found = what()
         made = figure(found)
         made.savefig(folder / name, dpi=100, metadata={"Description": f"drawn from {sources(found)}"})
         plt.close(made)
-        yield folder / name
+    return [folder / name for name in PICTURES]
 
 
 if __name__ == "__main__":
-    for picture in draw(Path(sys.argv[1]) if sys.argv[1:] else RESULTS):
-        print(picture)
+    print(*draw(Path(sys.argv[1]) if sys.argv[1:] else RESULTS), sep="\n")

@@ -150,7 +150,7 @@ def crowded(one: dict[str, Any], others: list[dict[str, Any]]) -> bool:
     )
 
 
-def draw(folder: Path) -> Iterator[Path]:
+def draw(folder: Path) -> list[Path]:
     """One panel for each set of recordings, small labels beside each mark."""
     figure, panels = plt.subplots(len(SHIPPED), figsize=(5.2, 8.4), layout="constrained", sharex=True)
     used: dict[str, tuple[str, str]] = {}
@@ -181,9 +181,11 @@ def draw(folder: Path) -> Iterator[Path]:
     figure.supylabel("test accuracy (%), chip", fontsize=10)
     handles = [plt.Line2D([], [], color=c, marker=m, ls="", label=name) for name, (m, c) in used.items()]
     panels[0].legend(handles=handles, fontsize=8, loc="lower left")
-    figure.savefig(folder / "systems.png", dpi=130, metadata={"Description": f"drawn from {sources()}"})
-    yield folder / "systems.png"
+    picture = folder / "systems.png"
+    figure.savefig(picture, dpi=130, metadata={"Description": f"drawn from {sources()}"})
+    plt.close(figure)
+    return [picture]
 
 
 if __name__ == "__main__":
-    list(draw(Path(sys.argv[1]) if sys.argv[1:] else RESULTS))
+    print(*draw(Path(sys.argv[1]) if sys.argv[1:] else RESULTS), sep="\n")

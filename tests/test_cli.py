@@ -410,7 +410,7 @@ def test_a_rung_that_is_proven_is_what_it_would_be(as_json, monkeypatch):
     assert asked
 
 
-def test_exit_codes_are_those_of_the_docs(spikeloom, as_json, tmp_path):
+def test_exit_codes_of_failed_checks(spikeloom, as_json, tmp_path):
     assert as_json(*VERIFYING, "--require", "E2=1", codes=(1,))["missed"]
     chart = (
         "chart",

@@ -177,7 +177,7 @@ def test_the_textures_example_reaches_a_netlist(tmp_path, environment):
             archive.writestr(f"texture{texture:02}_speed{speed}_force{force}.npz", member.getvalue())
     made = tmp_path / "made"
     script = ROOT / "examples" / "textures.sh"
-    shown = run_example(environment, "bash", script, tmp_path / "made.zip", made, "8s")
+    shown = run_example(environment, "bash", script, tmp_path / "made.zip", made, "20s")
     for name in ("taxels.csv", "small.pt", "small.loom", "small.html"):
         assert (made / name).stat().st_size > 0
     assert "left out in turn: speed=1200, force=0.5, speed=6000, force=1.0" in shown
