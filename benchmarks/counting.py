@@ -114,7 +114,7 @@ def draw(folder: Path) -> list[Path]:
     for name, (what, figure) in PICTURES.items():
         found = what()
         made = figure(found)
-        made.savefig(folder / name, dpi=100, metadata={"Description": f"drawn from {sources(found)}"})
+        made.savefig(folder / name, dpi=80, metadata={"Description": f"drawn from {sources(found)}"})
         plt.close(made)
     return [folder / name for name in PICTURES]
 
