@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -50,8 +50,8 @@ class Layer:
         shape = *sources[0].shape[:2], self.size
         spikes = np.empty(shape, np.bool_)
         kept = np.empty(shape if membranes else _NONE, self._kind)
-        moved = np.zeros((2, 0), np.int32)
-        self._run(raster(sources), spikes.view(np.uint8), kept, np.empty(_NONE, np.uint8), moved)
+        unused = np.empty(_NONE, np.uint8), np.empty((0, 0), np.uint64), np.zeros((2, 0), np.int32)
+        self._run(raster(sources), spikes.view(np.uint8), kept, *unused)
         return spikes, kept
 
     def moved(self, sources: Raster, wanted: EventArray) -> npt.NDArray[np.int32]:
@@ -60,8 +60,11 @@ class Layer:
         `wanted` (samples, steps, bytes) has a bit for each neuron, the first lowest.
         """
         moved = np.zeros((2, self.size), np.int32)
-        fired = np.empty((1, 2, self.size), np.uint8)
-        self._run(sources, fired, np.empty(_NONE, self._kind), np.ascontiguousarray(wanted), moved)
+        words = np.zeros(
+            (2, wanted.shape[2]), np.uint64
+        )  # eight neurons each, which machine code compares at once
+        unkept = np.empty(_NONE, self._kind)
+        self._run(sources, words.view(np.uint8)[None], unkept, np.ascontiguousarray(wanted), words, moved)
         return moved
 
     def _run(self, *arrays: Any) -> None:
@@ -71,6 +74,10 @@ class Layer:
         state = np.empty((3, self.size), self._kind)
         listed = np.empty(self.size, np.int32)
         run_layer(arrays[0], *self.fixed, state, listed, *arrays[1:])
+
+    def with_bias(self, bias: AnyArray) -> Layer:
+        """The same neurons with another bias, (neurons,)."""
+        return replace(self, fixed=(*self.fixed[:2], bias.astype(self._kind), *self.fixed[3:]))
 
     @property
     def _kind(self) -> np.dtype[Any]:
@@ -185,9 +192,9 @@ def cut(spikes: BoolArray, lengths: IntArray | None) -> BoolArray:
     >>> cut(np.ones((2, 3, 1), bool), np.array([3, 1])).sum(axis=1).ravel().tolist()
     [3, 1]
     """
-    return (
-        spikes if lengths is None else spikes & (np.arange(spikes.shape[1]) < lengths[:, None])[:, :, None]
-    )
+    if lengths is None or np.all(lengths >= spikes.shape[1]):
+        return spikes
+    return spikes & (np.arange(spikes.shape[1]) < lengths[:, None])[:, :, None]
 
 
 def vote(counts: IntArray) -> IntArray:

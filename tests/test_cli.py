@@ -29,11 +29,12 @@ from spikeloom.models.progress import FORM
 from spikeloom.models.recordings.events import load_data
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.runtime import cli
+from spikeloom.runtime.commands.main_job import demo
 from spikeloom.runtime.equivalence import reference
 from spikeloom.runtime.inputs import network
 from spikeloom.runtime.inputs import recordings as recordings_input
 from spikeloom.runtime.machines import base
-from spikeloom.runtime.machines.loihi1 import engine
+from spikeloom.runtime.machines.loihi1 import block_kernel, engine
 from spikeloom.runtime.machines.loihi1.costs import pricing
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
@@ -172,6 +173,19 @@ def shipped_grasps(monkeypatch, tmp_path):
     monkeypatch.setattr(
         recordings_input, "synthetic_split", lambda split, **_: synthetic_split(split, limit=6)
     )
+
+
+def test_demo_compiles_ahead_on_another_core_where_no_machine_code_is_kept(tmp_path, monkeypatch):
+    kept = types.SimpleNamespace(stats=types.SimpleNamespace(cache_path=tmp_path))
+    monkeypatch.setattr(block_kernel, "run_recordings", kept)
+    monkeypatch.setattr(demo, "usable_cores", lambda: 1)
+    assert demo._compile_ahead() is None
+    monkeypatch.setattr(demo, "usable_cores", lambda: 2)
+    ahead = demo._compile_ahead()
+    ahead.join()
+    assert ahead.exitcode == 0
+    (tmp_path / "block_kernel.run_recordings-1.py311.nbi").touch()
+    assert demo._compile_ahead() is None
 
 
 @pytest.mark.usefixtures("shipped_grasps")

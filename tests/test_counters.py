@@ -19,6 +19,7 @@ from spikeloom.models.recordings.events import joined_bins, load_data, of_length
 from spikeloom.models.training import counters
 from spikeloom.models.training.counters import (
     Plan,
+    Rule,
     counters_of,
     cross_validate,
     fit,
@@ -71,6 +72,22 @@ def test_counters_spike_as_they_are_trained_to(plan):
         assert_array_equal(spikes.sum(axis=1), wanted.spikes[:, places])
         first = np.where(spikes.any(axis=1), spikes.argmax(axis=1), data.steps)
         assert_array_equal(first, wanted.at[:, places])
+
+
+@pytest.mark.parametrize("plan", PLANS, ids=str)
+def test_the_largest_sum_is_that_of_any_recording_after_any_step(plan, monkeypatch):
+    monkeypatch.setattr(counters, "TOGETHER", 7)
+    data = run_counters(made(), plan)
+    used = np.arange(1, len(data.counter), 2)
+    rule = Rule(
+        used=used, weight=np.random.default_rng(2).integers(-9, 9, (CLASSES, len(used))).astype(float)
+    )
+    sums = [
+        rule.weight @ np.where(at <= step, spikes, 0)
+        for at, spikes in zip(data.at[:, used], data.spikes[:, used], strict=True)
+        for step in range(data.steps)
+    ]
+    assert rule.highest(data) == np.max(sums)
 
 
 def test_a_counter_is_blocked_for_a_while_and_not_for_ever():

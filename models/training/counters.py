@@ -8,8 +8,6 @@ References
 ----------
 .. [1] R.-E. Fan et al., "LIBLINEAR: A Library for Large Linear Classification", JMLR 9, 2008: L2-loss SVC.
 .. [2] O. Chapelle, "Training a Support Vector Machine in the Primal", Neural Computation 19, 2007.
-.. [3] E. Frantar et al., "GPTQ: Accurate Post-Training Quantization for Generative Pre-trained Transformers",
-   ICLR 2023.
 """
 
 import math
@@ -19,12 +17,14 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
 from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import MOST_CLOCKS
 from spikeloom.compiler.errors import DataError, OptionError, require_least
+from spikeloom.compiler.rounding import round_in_turn, shares
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import WHOLE, Recordings
@@ -42,6 +42,9 @@ LEAST = 3
 MOST = 64
 """Thresholds at most."""
 
+TOGETHER = 64
+"""Recordings whose sums are held step by step at once: few enough for the caches."""
+
 THING = 3
 """Gain of the rules for objects over those for boundaries between their levels."""
 
@@ -54,9 +57,6 @@ LEAST_STEP = 1e-6
 
 BITS = range(2, 9)
 """Widths of a weight."""
-
-RIDGE = 0.03
-"""What is added to how often counters spike together, in terms of how often one spikes, where weights are rounded."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,14 +156,20 @@ class Rule:
         return np.asarray(data.spikes[:, self.used] @ self.weight.T)
 
     def highest(self, data: Counted) -> float:
-        """Largest sum that any class ever has after a step; second spikes count as the first."""
+        """Largest sum that any class ever has after a step; second spikes count as the first.
+
+        Weights are whole numbers here, so that sums are exact in any order.
+        """
         highest = -math.inf
-        for at, spikes in zip(data.at[:, self.used], data.spikes[:, self.used], strict=True):
-            order = at.argsort()
-            whole = np.append(np.diff(at[order]) > 0, True)  # where all spikes of a step are in the sum
-            highest = max(highest, float((self.weight * spikes)[:, order].cumsum(axis=1)[:, whole].max()))
-            if at[order[0]] > 0:
-                highest = max(highest, 0.0)  # before the first
+        for first in range(0, len(data.spikes), TOGETHER):
+            some = slice(first, first + TOGETHER)
+            spikes = data.spikes[some, self.used]
+            sample, counter = np.nonzero(spikes)
+            step = data.at[some, self.used][sample, counter]
+            entries = spikes[sample, counter], (sample * data.steps + step, counter)
+            arrived = sparse.csr_array(entries, (len(spikes) * data.steps, len(self.used))) @ self.weight.T
+            sums = arrived.reshape(len(spikes), data.steps, -1).cumsum(axis=1)
+            highest = max(highest, float(sums.max()))
         return highest
 
 
@@ -252,7 +258,8 @@ def _newton_of_weights(
 
 def _least_squares(alike: FloatArray, sign: FloatArray, strength: float) -> FloatArray:
     """Shares of recordings if all of them pull, as those short of the margin do."""
-    ridge = alike + np.eye(len(alike)) / (2 * strength)
+    ridge = alike.copy().T  # the same, as it is symmetric, in the order that LAPACK wants
+    np.einsum("ii->i", ridge)[:] += 1 / (2 * strength)
     return np.asarray(
         cho_solve(cho_factor(ridge, overwrite_a=True, check_finite=False), sign, check_finite=False)
     )
@@ -333,19 +340,12 @@ def fit(data: Counted, classes: int) -> Fitted:
 def round_weights(weight: FloatArray, spikes: FloatArray, most: int) -> FloatArray:
     """Whole weights (classes, counters) of at most a magnitude, whose sums over spikes (samples, counters) stay.
 
-    One counter after the other is rounded, those that spike most first, and the weights of those to come
-    make up for what its rounding does to the sums [3]_.
+    One counter after the other is rounded, those that spike most first, see :mod:`compiler.rounding`.
     """
-    alike = spikes.T @ spikes
-    order = np.argsort(-np.diag(alike), kind="stable")
-    alike += RIDGE * np.diag(alike).mean() * np.eye(len(alike))
-    pull = np.linalg.cholesky(np.linalg.inv(alike[order[:, None], order])).T
-    left = weight[:, order]
-    whole = np.zeros_like(weight)
-    for n, place in enumerate(order):
-        whole[:, place] = np.clip(np.rint(left[:, n]), -most, most)
-        missing = (left[:, n] - whole[:, place]) / pull[n, n]
-        left[:, n + 1 :] -= np.outer(missing, pull[n, n + 1 :])
+    together = spikes.T @ spikes
+    order = np.argsort(-np.diag(together), kind="stable")
+    whole = np.empty_like(weight)
+    whole[:, order] = round_in_turn(weight[:, order], shares(together[order[:, None], order]), most)
     return whole
 
 

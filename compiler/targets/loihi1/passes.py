@@ -187,7 +187,7 @@ def _remove(done: Compilation) -> Compilation:
 
 
 @step(
-    "cuts the layers over as few cores as every limit allows and puts the cores on tiles with the fewest spike-hops",
+    "cuts the layers over few cores, within every limit, and puts the cores on tiles with the fewest spike-hops",
     keeps="every spike: where a neuron sits has no influence on any",
 )
 def _place(done: Compilation) -> Compilation:

@@ -78,6 +78,8 @@ def kept_shares(decay_u: IntArray | int, decay_v: IntArray | int) -> tuple[Any, 
 def in_units(mantissa: IntArray, exponent: IntArray | int) -> IntArray:
     """``mantissa * 2**exponent``, int64; at exponent -1 mantissas are even."""
     wide = mantissa.astype(np.int64)
+    if np.ndim(exponent) == 0:
+        return wide >> 1 if exponent < 0 else wide << exponent
     return np.where(np.less(exponent, 0), wide >> 1, wide << np.maximum(exponent, 0))
 
 
@@ -146,6 +148,8 @@ def encode_bias(bias: FloatArray) -> tuple[IntArray, IntArray]:
     exponent = np.zeros(np.shape(bias), np.int64)
     for candidate in range(1, BIAS_EXPONENT_MAX + 1):
         too_small = np.abs(np.rint(np.ldexp(bias, -exponent))) > BIAS_MANTISSA_MAX
+        if not too_small.any():
+            break
         exponent = np.where(too_small, candidate, exponent)
     mantissa = np.rint(np.ldexp(bias, -exponent)).astype(np.int64)
     if np.any(np.abs(mantissa) > BIAS_MANTISSA_MAX):

@@ -1,11 +1,17 @@
 """The command ``demo``: the main job on what the package ships."""
 
+import io
+import multiprocessing
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import redirect_stderr
+from multiprocessing.process import BaseProcess
+from pathlib import Path
 from typing import Any
 
 from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.runtime.commands.main_job import compile, estimate, verify
+from spikeloom.runtime.commands.main_job.doctor import usable_cores
 from spikeloom.runtime.commands.options import request_of
 from spikeloom.runtime.equivalence.verdict import in_a_sentence
 from spikeloom.runtime.inputs import repeat
@@ -26,6 +32,12 @@ STEPS = (
 )
 """Commands that run in a new folder for temporary files, where the netlist stays."""
 
+IN_SMALL = (
+    ("compile", "pretrained:grasps", "-o", "{folder}/grasps.loom"),
+    *((*step, "--limit", "1") for step in STEPS[1:]),
+)
+"""What needs the machine code of all commands but the first."""
+
 
 REQUEST = Request
 
@@ -36,9 +48,10 @@ def run(_request: Request) -> Outcome:
     shown: list[Section] = []
     worst = 0
     folder = tempfile.mkdtemp(prefix="spikeloom-")
-    for name, *words in STEPS:
-        kind, run_it = COMMANDS[name]
-        outcome = run_it(request_of(kind, [word.format(folder=folder) for word in words]))
+    ahead = _compile_ahead()
+    for name, words, outcome in _outcomes(STEPS, folder):
+        if ahead is not None:
+            ahead.join()  # what it has not compiled by now would be compiled twice
         typed = " ".join(["spikeloom", name, *words]).replace("{folder}/", "")
         first, *others = outcome.sections(outcome.result)
         shown += [Section(first.title, [Code([typed]), *first.blocks]), *others]
@@ -48,3 +61,28 @@ def run(_request: Request) -> Outcome:
     verdict = f"verdict: {in_a_sentence(results['verify'])}\nkept: {net}; all of it on one page:"
     shown.append(Section("Next", [Text(verdict), Code([following])]))
     return Outcome(results, lambda _: shown, worst)
+
+
+def _outcomes(steps: Iterable[Sequence[str]], folder: str) -> Iterator[tuple[str, Sequence[str], Outcome]]:
+    """Run commands one after the other."""
+    for name, *words in steps:
+        kind, run_it = COMMANDS[name]
+        yield name, words, run_it(request_of(kind, [word.format(folder=folder) for word in words]))
+
+
+def _compile_ahead() -> BaseProcess | None:
+    """Let another core compile for the later commands while the first one runs, unless that was ever done."""
+    from spikeloom.runtime.machines.loihi1.block_kernel import run_recordings
+
+    folder = getattr(getattr(run_recordings, "stats", None), "cache_path", None)
+    if folder is None or usable_cores() == 1 or any(Path(folder).glob("*run_recordings*")):
+        return None
+    ahead = multiprocessing.get_context("spawn").Process(target=_run_in_small, daemon=True)
+    ahead.start()
+    return ahead
+
+
+def _run_in_small() -> None:
+    with tempfile.TemporaryDirectory() as folder, redirect_stderr(io.StringIO()):
+        for _ in _outcomes(IN_SMALL, folder):
+            pass

@@ -80,8 +80,12 @@ def sections(found: Diagnosis) -> Iterator[Section]:
 def _machine() -> Iterator[Check]:
     yield Check(what="spikeloom", found=f"{__version__} in {resources.files('spikeloom')}")
     yield Check(what="Python", found=f"{platform.python_version()} on {platform.platform()}")
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    yield Check(what="cores", found=f"{usable} of {os.cpu_count()} usable, {platform.machine()}")
+    yield Check(what="cores", found=f"{usable_cores()} of {os.cpu_count()} usable, {platform.machine()}")
+
+
+def usable_cores() -> int | None:
+    """Cores that this process may use, None where the system does not say."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
 def _libraries() -> Iterator[Check]:

@@ -98,13 +98,15 @@ def aligned(netlist: Netlist, array: AnyArray, layer: int) -> AnyArray:
     """
     depth = netlist.layers[layer].depth
     length = array.shape[-2] - netlist.drain
+    neurons = netlist.layers[layer].neurons
     ids = netlist.compartments_of(layer)
-    part = array[..., depth : depth + length, ids]
-    if len(ids) == netlist.layers[layer].neurons:
-        return part
-    whole = np.zeros((*part.shape[:-1], netlist.layers[layer].neurons), part.dtype)
-    whole[..., netlist.neuron[ids]] = part
-    return whole
+    if not len(ids):
+        return np.zeros((*array.shape[:-2], length, neurons), array.dtype)
+    place = np.full(neurons, -1)
+    place[netlist.neuron[ids]] = ids - ids[0]
+    part = array[..., depth : depth + length, ids[0] : ids[-1] + 1].take(place, axis=-1)
+    part[..., place < 0] = 0
+    return part
 
 
 def range_error(

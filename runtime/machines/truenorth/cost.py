@@ -254,7 +254,7 @@ def sections(found: Estimate) -> list[Section]:
     events = [each.events_j for each in found.energy if each.floor_j is not None]
     lines = [
         *map(_reading_line, found.energy),
-        "two readings of one measurement: take one, never their sum",
+        "each prices the whole chip by a measurement of its own: take one, never their sum",
         f"a data step takes {si(pace.step_s, 's')}: {'keeps' if pace.real_time else 'does not keep'} the sensor's pace "
         f"of {1000 * pace.bin_s:g} ms a step",
         f"static power of a chip: {', '.join(static)}",

@@ -314,7 +314,7 @@ def families(tried: Sequence[Tried]) -> tuple[Family, ...]:
         Family(
             system=system,
             tried=len(same),
-            best=max(same, key=lambda each: (each.rung, each.accuracy)).number,
+            best=max(same, key=lambda each: (min(each.rung, RUNGS), each.accuracy)).number,
             finished=any(each.rung >= RUNGS for each in same)
             and all(each.finished in (None, True) for each in same if each.rung >= RUNGS),
         )

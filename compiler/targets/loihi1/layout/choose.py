@@ -1,4 +1,4 @@
-"""Lay a network out on as few cores as every limit allows.
+"""Lay a network out on few cores, within every limit.
 
 The integer network is not changed: which neuron sits where has no influence on any spike. A layer on more
 cores is swept and fed in parallel, but each of its spikes, and each spike that it receives, is sent to more

@@ -1,4 +1,4 @@
-"""Cut populations into chunks that fit a core and pack the chunks on as few cores as possible.
+"""Cut populations into chunks that fit a core and pack the chunks on few cores.
 
 The integer network is not changed: which neuron sits where has no influence on any spike.
 

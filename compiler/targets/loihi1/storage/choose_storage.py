@@ -17,6 +17,7 @@ from spikeloom.compiler.ir import Form, Network, Population, row_parts
 from spikeloom.compiler.passes.calibrate import MANY, NUDGES, Calibration, fewer
 from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.base import Target
+from spikeloom.compiler.targets.loihi1.bounds import one_sided
 from spikeloom.compiler.targets.loihi1.integers import IntegerNetwork, IntegerPopulation, integer_layer
 from spikeloom.compiler.targets.loihi1.legalize import stored_once
 from spikeloom.compiler.targets.loihi1.options import check_packings
@@ -42,7 +43,7 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     with_spike_errors,
 )
 from spikeloom.compiler.targets.loihi1.storage.ties import ties_moved, without_memory
-from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, loads
+from spikeloom.compiler.targets.loihi1.storage.weight_storage import current_load, fullest
 from spikeloom.compiler.types import FloatArray
 
 CLIPPING = tuple(2 ** (k / 4) for k in range(21))
@@ -173,13 +174,15 @@ def adjust_biases(layer: FloatLayer, stored: Rounded, calibration: Calibration) 
         mantissa, exponent = encode_bias(np.clip(bias, -most, most))
         return replace(before, bias_mantissa=mantissa, bias_exponent=exponent)
 
+    sums = one_sided(stored.projections, before.size)
+    ready = integer_layer(before, stored.projections, loops=False)
     bias = before.bias.astype(np.float64)
-    fewest = with_spike_errors(stored, layer.post, calibration).moved
+    fewest = calibration.moved(ready, layer.post)
     for share in (sign * nudge for nudge in NUDGES for sign in (1, -1)):
         trial = at(bias + share * unit)
-        moved = with_spike_errors(replace(stored, population=trial), layer.post, calibration).moved
+        moved = calibration.moved(ready.with_bias(trial.bias), layer.post)
         better = spike_cost(moved) < spike_cost(fewest)
-        better &= loads(trial, stored.projections) <= ONE_STEP_SUM_MAX
+        better &= fullest(trial, *sums) <= ONE_STEP_SUM_MAX
         bias = np.where(better, bias + share * unit, bias)
         fewest = np.where(better, moved, fewest)
     after = at(bias)

@@ -1,16 +1,7 @@
 """Round the weights of a layer so that the errors of its synapses cancel on what the layer usually gets.
 
-Nearest rounding treats synapses one by one. Here they are rounded one after the other, and what one gains or
-loses is made up for by those still to come, as far as their inputs spike together; the bias takes up the
-mean that is left. No register, width or count changes.
-
-References
-----------
-.. [1] B. Hassibi, D. Stork, "Second order derivatives for network pruning: Optimal Brain Surgeon", NIPS 1992.
-.. [2] E. Frantar et al., "GPTQ: Accurate post-training quantization for generative pre-trained transformers", 2022,
-   arXiv:2210.17323: the order-by-order update through a Cholesky factor.
-.. [3] L. Babai, "On Lovász' lattice reduction and the nearest lattice point problem", Combinatorica 6, 1986: the same
-   integers without an inverse.
+Nearest rounding treats synapses one by one. Here they are rounded one after the other, see
+:mod:`compiler.rounding`; the bias takes up the mean that is left. No register, width or count changes.
 """
 
 from collections import defaultdict
@@ -22,6 +13,7 @@ import numpy.typing as npt
 
 from spikeloom.compiler.ir import Projection
 from spikeloom.compiler.passes.calibrate import Calibration
+from spikeloom.compiler.rounding import round_in_turn, shares
 from spikeloom.compiler.targets.loihi1.registers import ONE_STEP_SUM_MAX, reach, step_units
 from spikeloom.compiler.targets.loihi1.storage.scales import (
     FloatLayer,
@@ -31,13 +23,7 @@ from spikeloom.compiler.targets.loihi1.storage.scales import (
     with_spike_errors,
 )
 from spikeloom.compiler.targets.loihi1.storage.weight_storage import loads, nearest_steps, scales
-from spikeloom.compiler.types import FloatArray, IntArray
-
-DAMPING = 0.03
-"""Share of the mean activity that is added to each input's own."""
-
-BLOCK = 64
-"""Columns to which the errors of all earlier ones are passed on at once: the same sums, as one matrix product."""
+from spikeloom.compiler.types import IntArray
 
 AT_ONCE = 1 << 19
 """Weights that are rounded at a time; the last bits of their sums depend on it."""
@@ -75,7 +61,7 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
         shown = shown[rate[inputs[shown]] > 0]
         together = np.empty((len(shown), len(shown)))
         coincidences(times[inputs[shown]], together)
-        share = _share(together)
+        share = shares(together)
         for rows in np.array_split(neurons, -(-len(neurons) * len(inputs) // AT_ONCE) or 1):
             places = [_places(p, rows) for p in projections]
             weight = np.concatenate(
@@ -83,7 +69,7 @@ def compensated(layer: FloatLayer, plain: Rounded, calibration: Calibration) -> 
             )
             exact = np.clip(weight * (scale[rows] / step)[:, None], -limit, limit)
             whole = np.rint(exact)
-            whole[:, shown] = np.clip(_round_in_turn(exact[:, shown], share), -limit, limit)
+            whole[:, shown] = np.clip(round_in_turn(exact[:, shown], share), -limit, limit)
             less = (exact - whole)[:, shown]
             wanted = exact @ meant[inputs] - whole @ rate[inputs]
             most = (np.sum(sign * np.maximum(sign * less, 0), axis=1) for sign in (-1, 1))
@@ -138,24 +124,3 @@ def _spike_times(layer: FloatLayer, calibration: Calibration) -> npt.NDArray[np.
         bits = np.packbits(spikes.reshape(-1, spikes.shape[2]), axis=0)
         times.append(np.pad(bits, ((0, -len(bits) % 8), (0, 0))).T)
     return np.ascontiguousarray(np.concatenate(times, axis=1)).view(np.uint64)
-
-
-def _share(together: FloatArray) -> FloatArray:
-    """How much of each input's error the later ones make up for: a Cholesky factor, columns scaled."""
-    damped = together + np.eye(len(together)) * (DAMPING * np.trace(together) / max(len(together), 1))
-    factor: FloatArray = np.linalg.cholesky(damped[::-1, ::-1])[::-1, ::-1]
-    return factor / np.diag(factor)
-
-
-def _round_in_turn(weight: FloatArray, share: FloatArray) -> FloatArray:
-    """Round columns one after the other, each error passed on to the columns that follow."""
-    rounded = np.empty_like(weight)
-    errors = np.empty_like(weight)
-    for start in range(0, weight.shape[1], BLOCK):
-        block = slice(start, start + BLOCK)
-        wanted = weight[:, block] + errors[:, :start] @ share[:start, block]
-        for j in range(start, start + wanted.shape[1]):
-            rounded[:, j] = np.rint(wanted[:, j - start])
-            errors[:, j] = weight[:, j] - rounded[:, j]
-            wanted[:, j + 1 - start :] += np.outer(errors[:, j], share[j, j + 1 : start + BLOCK])
-    return rounded

@@ -6,6 +6,7 @@ here.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -36,7 +37,7 @@ SCALE_STEPS = 1024
 """A scale that the accumulator limits is the finest to one part in this many."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)  # without slots, for what is computed once
 class FloatLayer:
     """One population with the synapses into it, and what is known of its activity."""
 
@@ -45,6 +46,7 @@ class FloatLayer:
     post: int  # Its index in the network
     calibration: Calibration | None = None  # Spikes of the float model
 
+    @cached_property
     def peaks(self) -> FloatArray:
         """Magnitude of the largest weight of each neuron; shape (neurons,)."""
         peaks = np.zeros(self.population.size)
@@ -53,6 +55,15 @@ class FloatLayer:
                 largest = abs(projection.weight[rows]).max(axis=1).toarray().ravel()
                 peaks[rows] = np.maximum(peaks[rows], largest)
         return peaks
+
+    @cached_property
+    def unit(self) -> float:
+        """Largest of 1, 1/2, … 1/64 of which all weights are multiples; 0 without one."""
+        parts = [p.weight.data[part] for p in self.projections for part in entry_parts(p.weight)]
+        units = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32, 1 / 64)
+        if any(np.any(part % units[-1]) for part in parts):
+            return 0.0  # as most networks, after one pass over their weights
+        return next(unit for unit in units if not any(np.any(part % unit) for part in parts))
 
 
 def layer_of(network: Network, post: int, calibration: Calibration | None = None) -> FloatLayer:
@@ -196,15 +207,6 @@ def mantissa_scale(layer: Rounded) -> float:
     return float(layer.population.scale.min()) / 2.0 ** layer.form.exponents[0]
 
 
-def _unit(projections: Sequence[Projection]) -> float:
-    """Largest of 1, 1/2, … 1/64 of which all weights are multiples; 0 without one."""
-    parts = [p.weight.data[part] for p in projections for part in entry_parts(p.weight)]
-    units = (1.0, 1 / 2, 1 / 4, 1 / 8, 1 / 16, 1 / 32, 1 / 64)
-    if any(np.any(part % units[-1]) for part in parts):
-        return 0.0  # as most networks, after one pass over their weights
-    return next(unit for unit in units if not any(np.any(part % unit) for part in parts))
-
-
 def candidate(
     layer: FloatLayer, packing: Packing, factor: float, exponents: tuple[int, ...]
 ) -> tuple[Rounded | None, bool]:
@@ -215,11 +217,11 @@ def candidate(
     limit the scale: a larger factor gives the same.
     """
     bits = packing.bits
-    peak = float(layer.peaks().max(initial=0))
+    peak = float(layer.peaks.max(initial=0))
     chosen = None
     limited = False
     finest = 0.0
-    unit = _unit(layer.projections)
+    unit = layer.unit
     worthwhile = 1.0 if unit else WORTHWHILE
     for exponent in sorted(exponents):
         stored = planes_from(exponent, bits, packing.planes, max(exponents))
@@ -241,7 +243,7 @@ def finest_thresholds(layer: FloatLayer, bits: int, exponents: tuple[int, ...]) 
     """Largest threshold of each neuron that registers and its largest weight allow; 0 if none."""
     population = layer.population
     with np.errstate(divide="ignore"):
-        largest = population.theta * reach(bits, exponents) * step_units(bits, exponents) / layer.peaks()
+        largest = population.theta * reach(bits, exponents) * step_units(bits, exponents) / layer.peaks
     high = np.minimum(largest, _largest_threshold(population)).astype(np.int64) + 1  # one more than allowed
     low = np.zeros(population.size, np.int64)
     while np.any(high - low > np.maximum(1, low // SCALE_STEPS)):

@@ -113,7 +113,7 @@ def _full_range(layer: FloatLayer, candidate: Rounded) -> BoolArray:
     """Whether the largest weight of each neuron fills the planes; shape (neurons,)."""
     form = candidate.form
     scale = candidate.population.scale
-    steps = layer.peaks() * scale / step_units(form.bits, form.exponents)
+    steps = layer.peaks * scale / step_units(form.bits, form.exponents)
     return steps >= AT_LIMIT * reach(form.bits, form.exponents)
 
 

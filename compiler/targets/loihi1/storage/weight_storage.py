@@ -62,10 +62,12 @@ def nearest_steps(population: ir.Population, projection: ir.Projection, form: ir
     """Weights of a projection in whole steps of the finest plane, each rounded to the nearest; shape (synapses,)."""
     weight = projection.weight
     scale = scales(population, form)
+    alike = len(scale) > 0 and np.ptp(scale) == 0
     steps = np.empty(weight.nnz, MANTISSA if len(form.exponents) == 1 else np.int32)
     for rows in ir.row_parts(weight):
         entries = slice(weight.indptr[rows.start], weight.indptr[rows.stop])
-        each = np.repeat(scale[rows], np.diff(weight.indptr[rows.start : rows.stop + 1]))
+        lengths = np.diff(weight.indptr[rows.start : rows.stop + 1])
+        each = scale[0] if alike else np.repeat(scale[rows], lengths)
         steps[entries] = round_steps(weight.data[entries], each, form.bits, form.exponents)
     return steps
 
