@@ -60,9 +60,7 @@ class Layer:
         `wanted` (samples, steps, bytes) has a bit for each neuron, the first lowest.
         """
         moved = np.zeros((2, self.size), np.int32)
-        words = np.zeros(
-            (2, wanted.shape[2]), np.uint64
-        )  # eight neurons each, which machine code compares at once
+        words = np.zeros((2, wanted.shape[2]), np.uint64)  # of eight neurons, which are compared at once
         unkept = np.empty(_NONE, self._kind)
         self._run(sources, words.view(np.uint8)[None], unkept, np.ascontiguousarray(wanted), words, moved)
         return moved
