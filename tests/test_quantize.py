@@ -14,7 +14,6 @@ from numpy.testing import assert_array_equal
 from spikeloom.compiler.interpret import run_float
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import calibrate, evenly_spaced
-from spikeloom.compiler.rounding import DAMPING, round_in_turn, shares
 from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.loihi1 import registers
 from spikeloom.compiler.targets.loihi1.bounds import one_sided, prove_ranges
@@ -192,20 +191,6 @@ def test_spikes_are_compared_whatever_the_number_of_neurons(neurons):
     found = with_spike_errors(coarse, 0, calibration).moved
     assert_array_equal(found, spike_cost(assemble(network, [coarse]), calibration, 0))
     assert found[0].any()
-
-
-@pytest.mark.parametrize("most", [1, 3, np.inf])
-def test_each_input_is_rounded_where_those_to_come_can_make_up_for_the_most(most):
-    rng = np.random.default_rng(0)
-    spikes = (rng.random((90, 70)) < 0.4).astype(np.float64)  # more inputs than one block
-    weight = rng.normal(0, 2, (5, 70))
-    together = spikes.T @ spikes
-    found = round_in_turn(weight, shares(together), most)
-    damped = together + DAMPING * np.trace(together) / 70 * np.eye(70)
-    for n in range(70):  # what is left is free: least squares, given those that are rounded
-        off = weight[:, :n] - found[:, :n]
-        left = weight[:, n:] + np.linalg.solve(damped[n:, n:], damped[n:, :n] @ off.T).T
-        assert_array_equal(found[:, n], np.clip(np.rint(left[:, 0]), -most, most))
 
 
 def test_a_layer_is_judged_on_the_rounded_spikes_of_the_one_before_and_nudged_only_where_that_helps():

@@ -11,6 +11,7 @@ from random_networks import BITS, LOIHI, chain, float_networks, moved, recording
 
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import calibrate
+from spikeloom.compiler.rounding import DAMPING, round_in_turn, shares
 from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.loihi1.bounds import one_sided, prove_ranges
 from spikeloom.compiler.targets.loihi1.integers import verify
@@ -22,7 +23,7 @@ from spikeloom.compiler.targets.loihi1.registers import (
     weight_step,
 )
 from spikeloom.compiler.targets.loihi1.storage.choose_storage import choose_storage
-from spikeloom.compiler.targets.loihi1.storage.compensate import DAMPING, _round_in_turn, _share, compensated
+from spikeloom.compiler.targets.loihi1.storage.compensate import compensated
 from spikeloom.compiler.targets.loihi1.storage.scales import (
     SCALE_STEPS,
     finest_thresholds,
@@ -198,7 +199,8 @@ def test_groups_of_scales_are_proven_after_the_last_rounding(seed):
     assert choice.groups > 1
 
 
-def test_each_error_is_made_up_for_as_well_as_the_inputs_to_come_can():
+@pytest.mark.parametrize("most", [1, 5, np.inf])
+def test_each_error_is_made_up_for_as_well_as_the_inputs_to_come_can(most):
     """Input after input, with the least squares of those to come solved anew each time; more than a block of them."""
     rng = np.random.default_rng(3)
     events = np.repeat(rng.random((400, 24)) < 0.3, 3, axis=1) & (rng.random((400, 72)) < 0.8)
@@ -209,10 +211,10 @@ def test_each_error_is_made_up_for_as_well_as_the_inputs_to_come_can():
     left, expected = weight.copy(), np.zeros_like(weight)
     for position, j in enumerate(order):
         rest = order[position + 1 :]
-        expected[:, j] = np.rint(left[:, j])
+        expected[:, j] = np.clip(np.rint(left[:, j]), -most, most)
         error = left[:, j] - expected[:, j]
         left[:, rest] += np.outer(error, np.linalg.solve(damped[np.ix_(rest, rest)], damped[rest, j]))
-    found = _round_in_turn(weight[:, order], _share(together[np.ix_(order, order)]))
+    found = round_in_turn(weight[:, order], shares(together[np.ix_(order, order)]), most)
     assert_array_equal(found, expected[:, order])
     assert np.any(expected != np.rint(weight))
 

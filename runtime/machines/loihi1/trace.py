@@ -102,9 +102,10 @@ def aligned(netlist: Netlist, array: AnyArray, layer: int) -> AnyArray:
     ids = netlist.compartments_of(layer)
     if not len(ids):
         return np.zeros((*array.shape[:-2], length, neurons), array.dtype)
+    first = ids.min()
     place = np.full(neurons, -1)
-    place[netlist.neuron[ids]] = ids - ids[0]
-    part = array[..., depth : depth + length, ids[0] : ids[-1] + 1].take(place, axis=-1)
+    place[netlist.neuron[ids]] = ids - first
+    part = array[..., depth : depth + length, first : ids.max() + 1].take(place, axis=-1)
     part[..., place < 0] = 0
     return part
 
