@@ -16,7 +16,7 @@ from made_files import weights as made_weights
 from numpy.testing import assert_array_equal
 
 from spikeloom.__main__ import main as start
-from spikeloom.compiler import __version__
+from spikeloom.compiler import __version__, layer_kernel
 from spikeloom.compiler.formats.text import text
 from spikeloom.compiler.interpret import channels_last
 from spikeloom.compiler.targets.base import EVENTS, load_target
@@ -34,7 +34,7 @@ from spikeloom.runtime.equivalence import reference
 from spikeloom.runtime.inputs import network
 from spikeloom.runtime.inputs import recordings as recordings_input
 from spikeloom.runtime.machines import base
-from spikeloom.runtime.machines.loihi1 import block_kernel, engine
+from spikeloom.runtime.machines.loihi1 import engine
 from spikeloom.runtime.machines.loihi1.costs import pricing
 
 SIZES = {"conv1": TAXELS * FEATURES, "fc1": 9, "fc2": 8, "fc3": CLASSES}
@@ -177,14 +177,14 @@ def shipped_grasps(monkeypatch, tmp_path):
 
 def test_demo_compiles_ahead_on_another_core_where_no_machine_code_is_kept(tmp_path, monkeypatch):
     kept = types.SimpleNamespace(stats=types.SimpleNamespace(cache_path=tmp_path))
-    monkeypatch.setattr(block_kernel, "run_recordings", kept)
+    monkeypatch.setattr(layer_kernel, "run_layer", kept)
     monkeypatch.setattr(demo, "usable_cores", lambda: 1)
     assert demo._compile_ahead() is None
     monkeypatch.setattr(demo, "usable_cores", lambda: 2)
     ahead = demo._compile_ahead()
     ahead.join()
     assert ahead.exitcode == 0
-    (tmp_path / "block_kernel.run_recordings-1.py311.nbi").touch()
+    (tmp_path / "layer_kernel.run_layer-1.py311.nbi").touch()
     assert demo._compile_ahead() is None
 
 

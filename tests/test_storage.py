@@ -11,7 +11,7 @@ from random_networks import BITS, LOIHI, chain, float_networks, moved, recording
 
 from spikeloom.compiler.ir import Form
 from spikeloom.compiler.passes.calibrate import calibrate
-from spikeloom.compiler.rounding import DAMPING, round_in_turn, shares
+from spikeloom.compiler.passes.rounding import DAMPING, round_in_turn, shares
 from spikeloom.compiler.storage import Packing
 from spikeloom.compiler.targets.loihi1.bounds import one_sided, prove_ranges
 from spikeloom.compiler.targets.loihi1.integers import verify

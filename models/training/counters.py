@@ -24,7 +24,7 @@ from spikeloom.compiler.arrays import read_only
 from spikeloom.compiler.counters import BLOCK, Counters
 from spikeloom.compiler.dynamics import MOST_CLOCKS
 from spikeloom.compiler.errors import DataError, OptionError, require_least
-from spikeloom.compiler.rounding import round_in_turn, shares
+from spikeloom.compiler.passes.rounding import round_in_turn, shares
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray
 from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.evtouch import WHOLE, Recordings
@@ -340,7 +340,7 @@ def fit(data: Counted, classes: int) -> Fitted:
 def round_weights(weight: FloatArray, spikes: FloatArray, most: int) -> FloatArray:
     """Whole weights (classes, counters) of at most a magnitude, whose sums over spikes (samples, counters) stay.
 
-    One counter after the other is rounded, those that spike most first, see :mod:`compiler.rounding`.
+    One counter after the other is rounded, those that spike most first, see :mod:`passes.rounding`.
     """
     together = spikes.T @ spikes
     order = np.argsort(-np.diag(together), kind="stable")

@@ -72,10 +72,10 @@ def _outcomes(steps: Iterable[Sequence[str]], folder: str) -> Iterator[tuple[str
 
 def _compile_ahead() -> BaseProcess | None:
     """Let another core compile for the later commands while the first one runs, unless that was ever done."""
-    from spikeloom.runtime.machines.loihi1.block_kernel import run_recordings
+    from spikeloom.compiler.layer_kernel import run_layer
 
-    folder = getattr(getattr(run_recordings, "stats", None), "cache_path", None)
-    if folder is None or usable_cores() == 1 or any(Path(folder).glob("*run_recordings*")):
+    folder = getattr(getattr(run_layer, "stats", None), "cache_path", None)
+    if folder is None or usable_cores() == 1 or any(Path(folder).glob("*run_layer*")):
         return None
     ahead = multiprocessing.get_context("spawn").Process(target=_run_in_small, daemon=True)
     ahead.start()

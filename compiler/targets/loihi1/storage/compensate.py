@@ -1,7 +1,7 @@
 """Round the weights of a layer so that the errors of its synapses cancel on what the layer usually gets.
 
 Nearest rounding treats synapses one by one. Here they are rounded one after the other, see
-:mod:`compiler.rounding`; the bias takes up the mean that is left. No register, width or count changes.
+:mod:`passes.rounding`; the bias takes up the mean that is left. No register, width or count changes.
 """
 
 from collections import defaultdict
@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from spikeloom.compiler.ir import Projection
 from spikeloom.compiler.passes.calibrate import Calibration
-from spikeloom.compiler.rounding import round_in_turn, shares
+from spikeloom.compiler.passes.rounding import round_in_turn, shares
 from spikeloom.compiler.targets.loihi1.registers import ONE_STEP_SUM_MAX, reach, step_units
 from spikeloom.compiler.targets.loihi1.storage.scales import (
     FloatLayer,
