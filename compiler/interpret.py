@@ -187,6 +187,8 @@ def channels_last(events: AnyArray, clocks: Clocks = NO_CLOCKS) -> BoolArray:
 def cut(spikes: BoolArray, lengths: IntArray | None) -> BoolArray:
     """Take away spikes (samples, steps, neurons) after the end of each recording; None where all are equally long.
 
+    Where nothing is to be taken away, the same array comes back.
+
     >>> cut(np.ones((2, 3, 1), bool), np.array([3, 1])).sum(axis=1).ravel().tolist()
     [3, 1]
     """

@@ -366,8 +366,9 @@ def run_layer(
 
     `fired` (recordings, steps, neurons) uint8 is filled, and `membranes`, likewise and before the reset,
     unless it is empty. Unless `wanted`, the same at a bit a neuron, is empty, `moved` (2, neurons) int32
-    counts in which entries a neuron differs from it, and the spikes that it has more. `fired` is then one
-    recording of two steps, neurons that do not exist at its end, and `words` the same, eight neurons in each.
+    counts in which entries a neuron differs from it, and the spikes that it has more. `fired` then has one
+    recording of two steps, with silent neurons up to a multiple of eight, and `words` (2, bytes) uint64 is the
+    same memory, eight neurons a word.
     """
     recordings, steps = (wanted if len(wanted) else fired).shape[:2]
     kept, last, _ = fired.shape

@@ -179,13 +179,14 @@ def test_demo_compiles_ahead_on_another_core_where_no_machine_code_is_kept(tmp_p
     kept = types.SimpleNamespace(stats=types.SimpleNamespace(cache_path=tmp_path))
     monkeypatch.setattr(layer_kernel, "run_layer", kept)
     monkeypatch.setattr(demo, "usable_cores", lambda: 1)
-    assert demo._compile_ahead() is None
+    assert demo._compile_ahead(str(tmp_path)) is None
     monkeypatch.setattr(demo, "usable_cores", lambda: 2)
-    ahead = demo._compile_ahead()
+    ahead = demo._compile_ahead(str(tmp_path))
     ahead.join()
     assert ahead.exitcode == 0
+    assert all(outcome.code == 0 for *_, outcome in demo._outcomes(demo.IN_SMALL, str(tmp_path)))
     (tmp_path / "layer_kernel.run_layer-1.py311.nbi").touch()
-    assert demo._compile_ahead() is None
+    assert demo._compile_ahead(str(tmp_path)) is None
 
 
 @pytest.mark.usefixtures("shipped_grasps")

@@ -88,6 +88,8 @@ def test_the_largest_sum_is_that_of_any_recording_after_any_step(plan, monkeypat
         for step in range(data.steps)
     ]
     assert rule.highest(data) == np.max(sums)
+    assert rule.highest(data.part(data.spikes.sum(axis=1) < 0)) == -np.inf
+    assert rule.highest(replace(data, spikes=0 * data.spikes)) == 0
 
 
 def test_a_counter_is_blocked_for_a_while_and_not_for_ever():

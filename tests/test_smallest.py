@@ -64,6 +64,11 @@ POOL = (
 )
 
 
+def test_the_best_of_a_system_is_the_most_accurate_of_those_in_the_last_round_or_beyond():
+    (family,) = study.families((*POOL, tried(6, 35, 10 * UJ, rung=4), tried(7, 40, UJ, rung=2)))
+    assert (family.best, family.tried) == (1, 7)
+
+
 def budgets(*words):
     return parse_budgets(words, study.LIMITS)
 

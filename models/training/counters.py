@@ -43,7 +43,7 @@ MOST = 64
 """Thresholds at most."""
 
 TOGETHER = 64
-"""Recordings whose sums are held step by step at once: few enough for the caches."""
+"""Recordings whose sums after each step are held at once."""
 
 THING = 3
 """Gain of the rules for objects over those for boundaries between their levels."""
@@ -165,11 +165,16 @@ class Rule:
             some = slice(first, first + TOGETHER)
             spikes = data.spikes[some, self.used]
             sample, counter = np.nonzero(spikes)
-            step = data.at[some, self.used][sample, counter]
-            entries = spikes[sample, counter], (sample * data.steps + step, counter)
-            arrived = sparse.csr_array(entries, (len(spikes) * data.steps, len(self.used))) @ self.weight.T
-            sums = arrived.reshape(len(spikes), data.steps, -1).cumsum(axis=1)
-            highest = max(highest, float(sums.max()))
+            begin = np.arange(len(spikes) + 1) * data.steps  # of each recording
+            at = begin[sample] + data.at[some, self.used][sample, counter]
+            steps, row = np.unique(at, return_inverse=True)  # in which anything spikes
+            entries = spikes[sample, counter], (row, counter)
+            gains = sparse.csr_array(entries, (len(steps), len(self.used))) @ self.weight.T
+            sums = np.vstack([np.zeros(len(self.weight)), gains]).cumsum(axis=0)
+            rows = np.searchsorted(steps, begin)
+            sums[1:] -= np.repeat(sums[rows[:-1]], np.diff(rows), axis=0)
+            least = 0.0 if np.setdiff1d(begin[:-1], steps).size else -math.inf  # where step 0 has no spike
+            highest = max(highest, float(sums[1:].max(initial=least)))
         return highest
 
 

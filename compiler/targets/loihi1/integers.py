@@ -127,7 +127,9 @@ def integer_layer(
     )
     weights = [(p, p.effective() * (1 << MEMBRANE_SHIFT)) for p in projections]
     largest = sum(abs(weight).sum(axis=1).max(initial=0) for _, weight in weights)
-    largest += MEMBRANE_MAX + (BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX)
+    largest += MEMBRANE_MAX + (
+        BIAS_MANTISSA_MAX << BIAS_EXPONENT_MAX
+    )  # of any bias: `Layer.with_bias` changes it
     # 32 bits are as exact, and twice as fast, where membranes have limits and no current outlasts its step
     dtype = np.int32 if saturates and not keep_u and largest < 2**31 else np.int64
     limit = MEMBRANE_MAX if saturates else 2**62

@@ -2,9 +2,10 @@
 
 import io
 import multiprocessing
+import signal
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, suppress
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -34,9 +35,9 @@ STEPS = (
 
 IN_SMALL = (
     ("compile", "pretrained:grasps", "-o", "{folder}/grasps.loom"),
-    *((*step, "--limit", "1") for step in STEPS[1:]),
+    ("estimate", "{folder}/grasps.loom", "--data", SYNTHETIC, "--limit", "1"),
 )
-"""What needs the machine code of all commands but the first."""
+"""Commands whose machine code the first of ``STEPS`` does not need: no two processes compile the same."""
 
 
 REQUEST = Request
@@ -48,7 +49,7 @@ def run(_request: Request) -> Outcome:
     shown: list[Section] = []
     worst = 0
     folder = tempfile.mkdtemp(prefix="spikeloom-")
-    ahead = _compile_ahead()
+    ahead = _compile_ahead(folder)
     for name, words, outcome in _outcomes(STEPS, folder):
         if ahead is not None:
             ahead.join()  # what it has not compiled by now would be compiled twice
@@ -70,19 +71,24 @@ def _outcomes(steps: Iterable[Sequence[str]], folder: str) -> Iterator[tuple[str
         yield name, words, run_it(request_of(kind, [word.format(folder=folder) for word in words]))
 
 
-def _compile_ahead() -> BaseProcess | None:
+def _compile_ahead(folder: str) -> BaseProcess | None:
     """Let another core compile for the later commands while the first one runs, unless that was ever done."""
     from spikeloom.compiler.layer_kernel import run_layer
 
-    folder = getattr(getattr(run_layer, "stats", None), "cache_path", None)
-    if folder is None or usable_cores() == 1 or any(Path(folder).glob("*run_layer*")):
+    kept = getattr(getattr(run_layer, "stats", None), "cache_path", None)
+    if kept is None or usable_cores() == 1 or any(Path(kept).glob("*run_layer*")):
         return None
-    ahead = multiprocessing.get_context("spawn").Process(target=_run_in_small, daemon=True)
+    ahead = multiprocessing.get_context("spawn").Process(target=_run_in_small, args=(folder,), daemon=True)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # which the process inherits: Ctrl-C is not for it
     ahead.start()
+    signal.signal(signal.SIGINT, before)
     return ahead
 
 
-def _run_in_small() -> None:
-    with tempfile.TemporaryDirectory() as folder, redirect_stderr(io.StringIO()):
-        for _ in _outcomes(IN_SMALL, folder):
+def _run_in_small(folder: str) -> None:
+    """Run on little, in silence: what goes wrong here the commands themselves will meet and say."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    silent = redirect_stderr(io.StringIO())
+    with suppress(Exception), tempfile.TemporaryDirectory(dir=folder) as own, silent:
+        for _ in _outcomes(IN_SMALL, own):
             pass

@@ -100,12 +100,9 @@ def aligned(netlist: Netlist, array: AnyArray, layer: int) -> AnyArray:
     length = array.shape[-2] - netlist.drain
     neurons = netlist.layers[layer].neurons
     ids = netlist.compartments_of(layer)
-    if not len(ids):
-        return np.zeros((*array.shape[:-2], length, neurons), array.dtype)
-    first = ids.min()
     place = np.full(neurons, -1)
-    place[netlist.neuron[ids]] = ids - first
-    part = array[..., depth : depth + length, first : ids.max() + 1].take(place, axis=-1)
+    place[netlist.neuron[ids]] = ids
+    part = array[..., depth : depth + length, place]
     part[..., place < 0] = 0
     return part
 

@@ -66,8 +66,8 @@ def nearest_steps(population: ir.Population, projection: ir.Projection, form: ir
     steps = np.empty(weight.nnz, MANTISSA if len(form.exponents) == 1 else np.int32)
     for rows in ir.row_parts(weight):
         entries = slice(weight.indptr[rows.start], weight.indptr[rows.stop])
-        lengths = np.diff(weight.indptr[rows.start : rows.stop + 1])
-        each = scale[0] if alike else np.repeat(scale[rows], lengths)
+        ends = weight.indptr[rows.start : rows.stop + 1]
+        each = scale[0] if alike else np.repeat(scale[rows], np.diff(ends))
         steps[entries] = round_steps(weight.data[entries], each, form.bits, form.exponents)
     return steps
 
