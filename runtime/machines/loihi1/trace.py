@@ -100,10 +100,15 @@ def aligned(netlist: Netlist, array: AnyArray, layer: int) -> AnyArray:
     length = array.shape[-2] - netlist.drain
     neurons = netlist.layers[layer].neurons
     ids = netlist.compartments_of(layer)
-    place = np.full(neurons, -1)
+    place = np.zeros(neurons, np.int64)
     place[netlist.neuron[ids]] = ids
-    part = array[..., depth : depth + length, place]
-    part[..., place < 0] = 0
+    part = np.empty((*array.shape[:-2], length, neurons), array.dtype)
+    recordings = array.reshape(-1, *array.shape[-2:]), part.reshape(-1, length, neurons)
+    for whole, cut in zip(*recordings, strict=True):
+        np.take(
+            whole[depth : depth + length], place, axis=1, out=cut, mode="clip"
+        )  # checked, it takes a copy
+    part[..., np.setdiff1d(np.arange(neurons), netlist.neuron[ids])] = 0
     return part
 
 
