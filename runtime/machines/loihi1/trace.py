@@ -105,9 +105,8 @@ def aligned(netlist: Netlist, array: AnyArray, layer: int) -> AnyArray:
     part = np.empty((*array.shape[:-2], length, neurons), array.dtype)
     recordings = array.reshape(-1, *array.shape[-2:]), part.reshape(-1, length, neurons)
     for whole, cut in zip(*recordings, strict=True):
-        np.take(
-            whole[depth : depth + length], place, axis=1, out=cut, mode="clip"
-        )  # checked, it takes a copy
+        # clipping changes no index here; without it numpy writes to a copy of `cut` first
+        np.take(whole[depth : depth + length], place, axis=1, out=cut, mode="clip")
     part[..., np.setdiff1d(np.arange(neurons), netlist.neuron[ids])] = 0
     return part
 
