@@ -17,6 +17,7 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import fmean  # on every Python the same digits, unlike `sum`
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -92,7 +93,7 @@ def points(data: str) -> list[dict[str, Any]]:
     if data == CONTAINERS:
         joined = stored("joined-containers-100ms.json")["last"]["5"]
         chip, networks = joined["mean"]["chip"], joined["networks"]
-        energies = [sum(each["energy_j"][table] for each in networks) / len(networks) for table in TABLES]
+        energies = [fmean(each["energy_j"][table] for each in networks) for table in TABLES]
         low, high = (end / 60 for end in chip["interval"])
         found.append(point("tactilesgnet", JOINED, chip["mean"] / 60, (low, high), energies))
     return [*found, *chosen(data)]
