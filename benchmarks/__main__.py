@@ -5,11 +5,11 @@
     python -m benchmarks --again --under 60                       # all that were seen to take less than 60 s
 
 A result depends on the files of this repository that the processes of its command opened to read, pages left out;
-``traced/sitecustomize.py`` notes them. ``--write`` stores the new result with its pictures, and in ``results/runs``
-the seconds that it took and a digest of each of these files: of Python its statements without comments and docstrings,
-of others the bytes. A result without such a record is ``not known`` to be up to date; ``finished`` is one whose script
-is only in the history. Commands run in a copy of this
-folder, beside links to ``$SPIKELOOM_SHARED/data``, ``checkpoints``, and what else they read, in FOLDER.
+``traced/sitecustomize.py`` notes them. ``--write`` stores the new result with its pictures, and in ``results/runs`` the
+seconds that it took and a digest of each of these files: of Python its statements without comments, docstrings and the
+words of ``--help``, of others the bytes. A result without such a record is ``not known`` to be up to date; ``finished``
+is one whose script is only in the history. Commands run in a copy of this folder, beside links to
+``$SPIKELOOM_SHARED/data``, ``checkpoints``, and what else they read, in FOLDER.
 """
 
 import argparse
@@ -67,6 +67,8 @@ def digest(name: str) -> str:
         for node in ast.walk(tree):
             if isinstance(getattr(node, "body", None), list):
                 node.body = list(itertools.filterfalse(is_text, node.body)) or [ast.Pass()]
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "option":
+                del node.args[:1]
         data = ast.unparse(tree).encode()
     return hashlib.sha256(data).hexdigest()[:16]
 

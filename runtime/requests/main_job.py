@@ -41,17 +41,17 @@ class CompileRequest(NetworkChoice):
     )
     target: str = option("chip: loihi1, or truenorth", default=DEFAULT_TARGET)
     weight_bits: str | None = option(
-        "bits of a stored weight, for all layers or one each: 2 to 6 or 8 (default: 8)",
+        "bits of a stored weight, for all layers or one each: 2 to 6 or 8 (default: 8; --calibrate chooses)",
         metavar="N[,N]",
         group="storage",
     )
     planes: str | None = option(
-        "synapses that together store one weight more finely, 1 to 3 (default: 1)",
+        "synapses that together store one weight more finely, 1 to 3 (default: 1; --calibrate chooses)",
         metavar="N[,N]",
         group="storage",
     )
     scale_groups: str | None = option(
-        "groups of neurons in a layer that have a scale of their own, 1 to 8 (default: 1)",
+        "groups of neurons in a layer that have a scale of their own, 1 to 8 (default: 1; --calibrate chooses)",
         metavar="N[,N]",
         group="storage",
     )

@@ -51,7 +51,7 @@ class TrainRequest(ClusterChoice, SensorChoice, DataChoice):
         group="network",
     )
     padding: str | None = option(
-        "padding of a grid-cnn: none, with stride 2 (default), or same, which needs more neurons than a core holds",
+        "padding of a grid-cnn: none, with stride 2 (default), or same, with which fc1 has more inputs than a core",
         choices=tuple(PADDINGS),
     )
     recipe: str = option(
