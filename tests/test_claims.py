@@ -60,7 +60,7 @@ EDITS = {
         "README.md": ("spikeloom compiles a trained", "Better than every machine, it compiles a trained")
     },
     "every limit of every chip": {
-        "README.md": ("It checks the limits of the chip", "It keeps every limit of every Intel chip, those")
+        "README.md": ("It checks the chip's published limits", "It keeps every limit of every Intel chip")
     },
     "points in words": {
         "docs/training.md": (
@@ -82,8 +82,8 @@ EDITS = {
     "swapped headers, verify": {VERIFY: ("| checkpoint | float | chip |", "| checkpoint | chip | float |")},
     "swapped headers, stability": {
         "docs/stability.md": (
-            "| Objects, released | Objects, counters |",
-            "| Objects, counters | Objects, released |",
+            "| Objects, `objects_manual` | Objects, counters |",
+            "| Objects, counters | Objects, `objects_manual` |",
         )
     },
     "swapped headers, reproduce": {
