@@ -130,8 +130,7 @@ def compile(
         from spikeloom.runtime.inputs.compilation import options_of
 
         given |= options_of(storage, given)
-    seen = {"calibrate": recordings_of({"data": calibrate}, "train")}
-    return _compiled(given | seen | {"checkpoint": source})
+    return _compiled(given | recordings_of(given, "calibrate") | {"checkpoint": source})
 
 
 @documented(NetworkChoice)
@@ -158,7 +157,9 @@ def load(
     """
     given = dict(locals())
     from spikeloom.runtime.commands.main_job import inspect
+    from spikeloom.runtime.inputs.files import require_netlist
 
+    require_netlist(os.fspath(path))
     facts: Shown = inspect.run(InspectRequest(path=os.fspath(path))).result
     origin = None if network is None else os.fspath(network)
     return Compiled(Path(path), origin, checked(NetworkChoice, given), facts)

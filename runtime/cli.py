@@ -61,6 +61,9 @@ GROUPS: dict[str, dict[str, str]] = {
 
 COMMANDS = {name: (group, summary) for group, names in GROUPS.items() for name, summary in names.items()}
 
+SHELLS = ("bash", "zsh", "tcsh")
+"""That completion scripts are written for."""
+
 Arguments = argparse.Namespace
 
 
@@ -74,7 +77,7 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Add what ``--config`` says; refuse an unknown option first, so that the near one can be named."""
         if self._subparsers is None:
-            if any(word.startswith("--config") for word in args):
+            if any(word.startswith("--c") for word in args):  # it may be shortened
                 from spikeloom.runtime.commands.config import with_config
 
                 args = with_config(self, args, COMMANDS)
@@ -123,9 +126,7 @@ def build_parser(chosen: str | None = None) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("-V", "--version", action="version", version=f"spikeloom {__version__}")
-    parser.add_argument(
-        "--print-completion", choices=("bash", "zsh", "tcsh"), help="print a completion script"
-    )
+    parser.add_argument("--print-completion", choices=SHELLS, help="print a completion script")
     hidden = argparse.SUPPRESS if chosen == "" else None  # the overview names them, by group
     commands = parser.add_subparsers(
         dest="command", required=True, metavar="COMMAND", help=hidden, prog="spikeloom"
@@ -157,6 +158,8 @@ def _parse(words: Sequence[str]) -> Arguments | None:
     if "--print-completion" in words:
         import shtab
 
+        if words[-1] not in SHELLS:
+            raise OptionError(f"--print-completion: give one of {', '.join(SHELLS)}")
         sys.stdout.write(shtab.complete(build_parser(), shell=words[-1]) + "\n")
         return None
     if first is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spikeloom.compiler.errors import ModelError, OptionError
+from spikeloom.compiler.files import write_atomically
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.requests.check import CertifyRequest, ExplainRequest, StressRequest
 from spikeloom.runtime.requests.choices import ComparisonChoice, NetworkChoice
@@ -27,6 +27,7 @@ from spikeloom.runtime.requests.main_job import (
 
 if TYPE_CHECKING:
     from spikeloom.compiler.ir import Network
+    from spikeloom.compiler.types import JsonObject
     from spikeloom.models.recordings.evtouch import Recordings
     from spikeloom.runtime.commands.exchange.export import Written
     from spikeloom.runtime.commands.main_job.run import Decisions
@@ -314,14 +315,16 @@ class Compiled:
         from spikeloom.runtime.commands.exchange import export
 
         given = dict(locals())
-        given |= {"source": str(self.path), "data": recordings_of(given, split or "test")}
+        given |= {"source": str(self.path)} | recordings_of(given)
         result: Written = export.run(checked(ExportRequest, given)).result
         return result
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the netlist, a ``.loom`` file."""
         require_place(os.fspath(path), "save", kinds=["loom"])
-        shutil.copyfile(self.path, path)
+        content = self.path.read_bytes()  # before the place is touched, which may be its own
+        with write_atomically(path) as file:
+            file.write(content)
 
     def stream(self) -> Stream:
         """Open a live stream: ``step(events)`` takes one bin (taxels, 2), and gives the votes so far.
@@ -338,7 +341,7 @@ class Compiled:
 
     def _question(self, kind: type[Request], given: Mapping[str, Any]) -> Any:
         """The request of a method from its keywords."""
-        return checked(kind, dict(given) | {"data": recordings_of(given), "netlist": str(self.path)})
+        return checked(kind, dict(given) | recordings_of(given) | {"netlist": str(self.path)})
 
     def _comparison(self, kind: type[ComparisonChoice], given: Mapping[str, Any]) -> Any:
         """The same, where the network is compared with."""
@@ -365,7 +368,9 @@ stress = Compiled.stress
 certify = Compiled.certify
 
 
-def recordings_of(given: Mapping[str, Any], split: str | None = None) -> Any:
-    """Recordings that a request takes: those of a split of ``Data``, or what was given."""
-    data = given["data"]
-    return data.split(split or given["split"]) if isinstance(data, Data) else data
+def recordings_of(given: Mapping[str, Any], name: str = "data") -> JsonObject:
+    """Keywords of a request for the recordings that were given: ``Data`` are read for its network, as by a command."""
+    data = given[name]
+    if not isinstance(data, Data):
+        return {name: data}
+    return {name: data.source, "bin": given.get("bin") if data.bin is None else data.bin}

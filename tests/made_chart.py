@@ -108,4 +108,5 @@ def made_chart(*budgets: str) -> results.Chart:
         points=tuple(points),
         refused=(results.Refused(network="grasps", cores="cores", stored=three, why=why),),
         budget=study.pick(points, parse_budgets(budgets), BY),
+        folder="out",
     )

@@ -103,6 +103,21 @@ def test_a_compiled_network_explains_itself_and_leaves(data, net, tmp_path):
     written = net.export(str(tmp_path / "net.nir"), "nir", dt=0.02)
     assert (written.format, (tmp_path / "net.nir").stat().st_size) == ("nir", written.bytes)
     refused(OptionError, "is for nir", net.export, str(tmp_path / "net.onnx"), "onnx", dt=0.02)
+    shown = str(written)
+    net.export(str(tmp_path / "net.onnx"), "onnx", form="step")
+    assert str(written) == shown
+    net.report(str(tmp_path / "page.html"), data.train, limit=2)
+    assert "--split train --limit 2" in (tmp_path / "page.html").read_text("utf-8")
+    net.save(tmp_path / "net.loom")
+    loaded = api.load(tmp_path / "net.loom")
+    loaded.save(tmp_path / "net.loom")  # its own file
+    assert (tmp_path / "net.loom").read_bytes() == net.path.read_bytes()
+
+
+def test_recordings_are_read_for_the_network_as_commands_read_them(net, write):
+    folder = write("events/a_label_1.csv", "time_s,taxel,polarity\n0,0,1\n0.2,1,0\n").parent
+    write("events/b_label_0.csv", "time_s,taxel,polarity\n0,1,1\n0.2,0,0\n")
+    assert str(net.run(api.recordings(folder))) == str(net.run(folder))  # events of two taxels of six
 
 
 def test_what_does_not_suit_is_refused(data, net):
@@ -135,6 +150,8 @@ def test_what_does_not_suit_is_refused(data, net):
     )
     refused(OptionError, "save none/x.loom: the folder does not exist", net.save, "none/x.loom")
     refused(OptionError, "save x.pt: has to end in .loom", net.save, "x.pt")
+    refused(OptionError, "pretrained:grasps: is a trained network", api.load, "pretrained:grasps")
+    refused(OptionError, "data data, test|Recordings found", lambda: api.train(data.test, "x.pt"))
     module = nn.Sequential(nn.Linear(2 * TAXELS, 4), api.LIF())
     refused(OptionError, "give example=", lambda: api.compile(module, example="x"))
     refused(ModelError, "example of shape (1, 3)", lambda: api.compile(module, example=torch.zeros(1, 3)))

@@ -333,6 +333,12 @@ def test_a_full_disk_behind_standard_output(spikeloom, monkeypatch, capsys):
     )
 
 
+def test_a_closed_standard_output(spikeloom, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdout", None)
+    assert cli.main(["inspect", "net.loom"]) == 2
+    assert "standard output: is closed" in capsys.readouterr().err
+
+
 def test_inspect_says_the_bins_that_a_network_was_trained_on(spikeloom, tmp_path):
     own_file(tmp_path / "binned.pt", training={"data": "taps", "bin_s": 0.05})
     spikeloom("compile", tmp_path / "binned.pt", "-o", tmp_path / "binned.loom")

@@ -47,6 +47,9 @@ jobs = 3
     # --keep is no short form of --keep-all, as it is an option of its own
     assert request_of("compile", "--config", str(path), "--keep", "0.5").keep_all
     assert request_of("chart", "n.pt", "--data", "d", "-o", "f", "--config", str(path)).jobs == 3
+    assert request_of("compile", "other.pt", "--conf", str(path)).checkpoint == "other.pt"  # shortened
+    path.write_bytes("\ufeff[compile]\ncheckpoint = 'marked.pt'\noutput = 'a.loom'".encode())
+    assert request_of("compile", "--config", str(path)).checkpoint == "marked.pt"
 
 
 @pytest.mark.parametrize(
@@ -97,3 +100,9 @@ def test_a_run_writes_its_options(spikeloom, place):
         "run", "net.loom", "--data", "data", "--limit", "2"
     )
     assert "no such file" in spikeloom("run", "--config", "none.toml")[2]
+    netlist = (place / "net.loom").read_bytes()
+    assert (
+        "net.loom: is an input"
+        in spikeloom("run", "net.loom", "--data", "data", "--write-config", "net.loom")[2]
+    )
+    assert (place / "net.loom").read_bytes() == netlist

@@ -108,6 +108,18 @@ def test_convert_to_joined_bins(own, split):
     assert coarse.any()
 
 
+def test_convert_numbers_the_classes_of_all_splits_alike(own):
+    for name, label in (("train/a", "oak wood"), ("train/b", "red ball"), ("test/a", "red ball")):
+        path = own / "named" / f"{name}.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"time_s,taxel,polarity,label\n0,0,1,{label}\n")
+    start("convert", "named", "-o", "out")
+    made = {file.relative_to("out").as_posix() for file in Path("out").rglob("sample*")}
+    assert made == {"train/sample_0_label_0.npy", "train/sample_1_label_1.npy", "test/sample_0_label_1.npy"}
+    path.write_text("time_s,taxel,polarity,label\n0,0,1,4\n")
+    refused(DataError, "classes '4' and 'oak wood'; give numbers", start, "convert", "named", "-o", "mixed")
+
+
 def test_convert_one_recording_to_lines_of_joined_bins(own):
     (own / "one.csv").write_text("time_s,taxel,polarity\n0.01,1,1\n0.03,1,1\n0.05,0,0\n")
     start("convert", "one.csv", "-o", "lines.csv", "--join", "2")

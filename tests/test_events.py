@@ -1,4 +1,5 @@
 import dataclasses
+import os
 import pickle
 from functools import partial
 from pathlib import Path
@@ -219,6 +220,17 @@ def test_folders_with_splits(write, tmp_path):
     assert load_data(tmp_path / "d" / "train").files == ("a_label_0.csv",)
 
 
+def test_a_label_does_not_depend_on_what_else_is_read(write):
+    for name in ("train/a_label_oak", "train/b_label_cork", "test/c_label_oak"):
+        write(f"d/{name}.csv", HEADER + "0,0,1\n")
+    folder = write("d/test/d_label_ball.csv", HEADER + "0,0,1\n").parent.parent
+    assert load_data(folder, "train").labels.tolist() == [2, 1]
+    assert load_data(folder, "test").labels.tolist() == [2, 0]
+    assert load_data(folder, "test", limit=1).labels.tolist() == [2]
+    names = ("ball", "cork", "oak", "3")
+    assert [load_data(folder, "test").class_name(label) for label in range(4)] == [*names]
+
+
 def test_one_released_recording(tmp_path):
     grasps = synthetic_grasps(per_class=1, steps=40, seed=0)
     np.save(tmp_path / "sample_0_label_3.npy", grasps.events[3].astype(np.float32))
@@ -298,6 +310,8 @@ def test_hot_taxels_exceed_five_times_the_median_and_silence_is_dead():
 def test_the_table_of_sources_holds_no_formula(tmp_path):
     write_released(tmp_path / "out", [made(np.ones((1, 2, 2, 3)), files=("=1+1.csv",))])
     assert (tmp_path / "out" / "sources.csv").read_text().endswith(",'=1+1.csv\n")
+    write_released(tmp_path / "numbers", [made(np.ones((1, 2, 2, 3)), groups={"angle": ("-5",)})])
+    assert (tmp_path / "numbers" / "recordings.csv").read_text().endswith(",-5\n")
 
 
 def test_writing_is_all_or_nothing(tmp_path, monkeypatch):
@@ -489,6 +503,19 @@ def test_any_number_of_polarities(tmp_path):
         [load_data(tmp_path, limit=1)],
         0.02,
     )
+
+
+@pytest.mark.skipif(not hasattr(os, "pread"), reason="this system has no forked processes")
+def test_reading_from_disk_moves_nothing_that_forked_processes_share(monkeypatch):
+    monkeypatch.setattr(stored, "IN_MEMORY", 1)
+    file = stored.EventFile()
+    grids = [np.full((2, 2, steps), 1, np.uint8) for steps in (9, 20)]
+    for grid in grids:
+        file.append(grid)
+    end = os.lseek(file._on_disk, 0, os.SEEK_CUR)
+    for index, grid in enumerate(grids):
+        assert_array_equal(file.read(index), grid)
+    assert os.lseek(file._on_disk, 0, os.SEEK_CUR) == end
 
 
 @pytest.mark.parametrize("in_memory", [1, 1 << 20])

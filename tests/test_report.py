@@ -552,7 +552,7 @@ def chart():
 
 
 def told(chart):
-    return terminal(printed(chart, "out")) + "\n"
+    return terminal(printed(chart)) + "\n"
 
 
 # -- terminal and files ------------------------------------------------------------------------------------------------

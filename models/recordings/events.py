@@ -7,7 +7,7 @@ recording counts for its own length.
 
 import math
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,7 +20,7 @@ from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.types import AnyArray, EventArray, IntArray
 from spikeloom.models.recordings import evtouch
 from spikeloom.models.recordings.arrays import Binned, bins_joined, one_width, read_binned
-from spikeloom.models.recordings.classes import numbered
+from spikeloom.models.recordings.classes import class_in_name, is_number, numbered
 from spikeloom.models.recordings.conditions import group_notes, groups_of
 from spikeloom.models.recordings.counts import GAP_S, EventCounts, time_note
 from spikeloom.models.recordings.csvtable import NOTHING, Row, is_table, rows_beside
@@ -101,7 +101,11 @@ def load_data(
         read, file = _read_all(
             [(member, members[member]) for member in files], where, rows, bins, taxels, released=released
         )
-    labels, names = numbered([each.label for each in read], table.classes, names, source)
+    classes_read = [each.label for each in read]
+    in_names = (
+        _classes_in_names(splits) if classes_read == [class_in_name(name) for name, _ in chosen] else set()
+    )
+    labels, names = numbered(classes_read, {*table.classes, *in_names}, names, source)
     for each, label in zip(read, labels.tolist(), strict=True):
         evtouch.require_class(each.where, label, classes)
     width = one_width([each.bin_s for each in read], source)
@@ -123,6 +127,12 @@ def load_data(
     notes += event_notes(data, read, taxels)
     notes += group_notes(source, [row.groups for row in rows]) if groups is None else []
     return data if released and not notes else replace(data, counts=_sum_counts(read, steps, notes))
+
+
+def _classes_in_names(splits: Mapping[str, Mapping[str, str]]) -> set[str]:
+    """Names of classes in those of the files of all splits: a part of them is numbered as all are."""
+    classes = {class_in_name(name) for files in splits.values() for name in files}
+    return {name for name in classes if name is not None and not is_number(name)}
 
 
 def _require_options(bin_s: float | None, limit: int | None) -> None:

@@ -7,7 +7,7 @@ first contact).
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -52,6 +52,11 @@ WIDTH = "bins.npy"
 _GIVE = "give the folder or zip that holds train/ and test/"
 
 Members = Mapping[str, Callable[[], IO[Any]]]
+
+
+def called(label: int, names: Sequence[str] | None) -> str:
+    """Name of a class; its number where it has none, as of a network with more classes than the recordings name."""
+    return names[label] if names is not None and 0 <= label < len(names) else str(label)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -133,7 +138,7 @@ class Recordings:
 
     def class_name(self, label: int) -> str:
         """What a class is called; its number, where it has no name."""
-        return str(label) if self.names is None else self.names[label]
+        return called(label, self.names)
 
     def steps_of(self, index: int) -> int:
         """Time steps of one recording."""

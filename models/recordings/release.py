@@ -6,6 +6,7 @@ name behind the label, columns of a table in a table.
 
 import csv
 import io
+import math
 import os
 import shutil
 import zipfile
@@ -17,7 +18,7 @@ import numpy as np
 from spikeloom.compiler.archive import ZIP_DATE, npy_bytes
 from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.compiler.files import beside, write_atomically
-from spikeloom.models.recordings.classes import class_in_name
+from spikeloom.models.recordings.classes import class_in_name, numbered, renamed
 from spikeloom.models.recordings.conditions import fields_in
 from spikeloom.models.recordings.csvtable import TABLES
 from spikeloom.models.recordings.events import need_labels
@@ -40,6 +41,7 @@ def write_released(
     path = Path(path)
     for recordings in splits:
         need_labels(recordings, "the released layout")
+    splits = _alike(splits)
     if not path.absolute().parent.is_dir():
         raise OptionError(f"-o {path}: the folder around it does not exist; make it first")
     if path.suffix.lower() == ".zip":
@@ -64,6 +66,15 @@ def write_released(
         if isinstance(error, OSError):
             raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
+
+
+def _alike(splits: Sequence[Recordings]) -> Sequence[Recordings]:
+    """Splits with one numbering of the classes that any of them names; DataError if another has numbers."""
+    if not any(recordings.names for recordings in splits):
+        return splits
+    known = {name for each in splits for name in each.names or map(str, each.labels.tolist())}
+    _, names = numbered((), known, None, splits[0].source)
+    return [renamed(recordings, names) for recordings in splits]
 
 
 def _members(splits: Sequence[Recordings], bin_s: float | None) -> Iterator[tuple[str, bytes]]:
@@ -96,8 +107,15 @@ def _members(splits: Sequence[Recordings], bin_s: float | None) -> Iterator[tupl
 
 
 def _no_formula(cell: str) -> str:
-    """A cell that no spreadsheet takes for a formula."""
-    return f"'{cell}" if cell[:1] in "=+-@\t\r" else cell
+    """A cell that no spreadsheet takes for a formula; a number is none."""
+    return f"'{cell}" if cell[:1] in "=+-@\t\r" and not _is_number(cell) else cell
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        return math.isfinite(float(cell))
+    except ValueError:
+        return False
 
 
 def _name(recordings: Recordings, index: int) -> str:

@@ -1,6 +1,7 @@
 """Events of many recordings in a temporary file, at a bit each: some at a time are read when they are asked for."""
 
 import math
+import os
 import weakref
 from collections.abc import Callable
 from functools import cached_property
@@ -28,19 +29,28 @@ class EventFile:
         weakref.finalize(self, self._file.close)
         self._lock = Lock()
         self._places: list[tuple[int, tuple[int, ...]]] = []
+        self._on_disk: int | None = None  # Descriptor, once it is there
 
     def append(self, grid: EventArray) -> None:
         """Write one more."""
         self._places.append((self._file.tell(), grid.shape))
         self._file.write(np.packbits(grid != 0).data)
+        if self._file.tell() > IN_MEMORY:
+            self._file.flush()
+            self._on_disk = self._file.fileno()
 
     def read(self, index: int) -> EventArray:
         """One of them, uint8."""
         place, shape = self._places[index]
         size = math.prod(shape)
-        with self._lock:
-            self._file.seek(place)
-            bits = np.frombuffer(self._file.read(-(-size // 8)), np.uint8)
+        # `seek` would move the place of forked processes, too
+        if self._on_disk is not None and hasattr(os, "pread"):
+            content = os.pread(self._on_disk, -(-size // 8), place)
+        else:
+            with self._lock:
+                self._file.seek(place)
+                content = self._file.read(-(-size // 8))
+        bits = np.frombuffer(content, np.uint8)
         return np.unpackbits(bits, count=size).reshape(shape)
 
     @property

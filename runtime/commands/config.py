@@ -12,6 +12,7 @@ from typing import Any
 
 from spikeloom.compiler.errors import OptionError
 from spikeloom.compiler.files import FileFault, read_whole, reading, write_atomically
+from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.requests.fields import Request, has_default
 
 READ = "--config"
@@ -29,14 +30,15 @@ def with_config(
     OptionError for a file that cannot be read, and for keys and tables that nothing has.
     """
     typed = list(words)
-    at = next((i for i, word in enumerate(typed) if word.partition("=")[0] == READ), None)
-    if at is None or typed[at:] == [READ]:
+    whole = {flag for each in parser._actions for flag in each.option_strings}
+    reads = _action(parser, READ[2:])
+    at = next((i for i, word in enumerate(typed) if reads and _is_typed(reads, [word], whole)), None)
+    if at is None or ("=" not in typed[at] and at + 1 == len(typed)):
         return typed  # the parser says that there is no file
     path = typed[at].partition("=")[2] or typed[at + 1]
     command = parser.prog.removeprefix("spikeloom ")
     more: list[str] = []
     places: list[str] = []
-    whole = {flag for each in parser._actions for flag in each.option_strings}
     for key, value in _table(path, command, commands).items():
         action = _action(parser, key)
         if action is None or key in (READ[2:], WRITE[2:]):
@@ -45,13 +47,23 @@ def with_config(
             places += _texts(path, key, value)
         elif not _is_typed(action, typed, whole):
             more += _typed(path, key, value, action)
-    return [*places, *more, *typed]
+    return [*more, *typed] if places and _has_places(parser, [*more, *typed]) else [*places, *more, *typed]
+
+
+def _has_places(parser: argparse.ArgumentParser, words: Sequence[str]) -> bool:
+    """Whether a word that stands alone is among them."""
+    try:
+        known, _ = argparse.ArgumentParser.parse_known_args(parser, words)
+    except OptionError:
+        return False
+    alone = [each for each in parser._actions if not each.option_strings]
+    return any(getattr(known, each.dest, each.default) not in (each.default, None, []) for each in alone)
 
 
 def _table(path: str, command: str, commands: Collection[str]) -> Mapping[str, Any]:
     """The table of a command, which may be missing."""
     with reading(path, OptionError, "give a TOML file with a table [COMMAND]"):
-        tables = tomllib.loads(read_whole(Path(path), "file of options", SIZE_LIMIT).decode())
+        tables = tomllib.loads(read_whole(Path(path), "file of options", SIZE_LIMIT).decode("utf-8-sig"))
         if stray := [name for name, table in tables.items() if not isinstance(table, dict)]:
             raise FileFault(f"{stray[0]} is in no table; write [{command}] above it")
         if unknown := [name for name in tables if name.split(" ")[0] not in commands]:
@@ -118,6 +130,7 @@ def write_config(path: str, command: str, request: Request) -> None:
                 name, value = flag[2:], True
         flags = [flag[2:] for flag in each.metadata["flags"] if flag.startswith("--")]
         lines.append(f"{(flags or [name])[0]} = {_toml(value)}")
+    require_place(path, WRITE, request, ["toml"])
     with write_atomically(path) as file:
         file.write(("\n".join(lines) + "\n").encode())
 

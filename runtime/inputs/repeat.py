@@ -41,6 +41,8 @@ def words(options: Mapping[str, Any]) -> list[str]:
 
     >>> words({"weight_bits": "4,8", "directed": True, "run": 0, "beta": 0.0, "planes": None, "bin": 0.02})
     ['--weight-bits', '4,8', '--directed', '--beta', '0.0', '--bin', '0.02']
+    >>> words({"bin": 1 / 60})
+    ['--bin', '0.016666666666666666']
     """
     typed: list[str] = []
     for name, value in options.items():
@@ -51,7 +53,7 @@ def words(options: Mapping[str, Any]) -> list[str]:
             continue
         typed.append(f"--{name.replace('_', '-')}")
         if value is not True:
-            typed.append(f"{value:g}" if name == "bin" else str(getattr(value, "source", value)))
+            typed.append(str(getattr(value, "source", value)))
     return typed
 
 

@@ -17,6 +17,7 @@ from spikeloom.compiler.targets.netlist_file import Netlist
 from spikeloom.compiler.types import FloatArray, IntArray, JsonObject
 from spikeloom.models.graphs import NEUTOUCH
 from spikeloom.models.recordings.evtouch import Recordings
+from spikeloom.models.recordings.grasps import SYNTHETIC
 from spikeloom.runtime.equivalence.verdict import Verdict
 from spikeloom.runtime.inputs import repeat
 from spikeloom.runtime.inputs.checkpoint import places_of
@@ -178,11 +179,11 @@ def provenance(
         | {f"time, {table.name}": table.title for table in target.time},
         versions={"spikeloom": __version__, "python": platform.python_version()}
         | {name: metadata.version(name) for name in PACKAGES},
-        commands=_commands(request, recording, data.bin_s),
+        commands=_commands(request, recording, data),
     )
 
 
-def _commands(request: ReportRequest, recording: str, bin_s: float | None) -> dict[str, str]:
+def _commands(request: ReportRequest, recording: str, used: Recordings) -> dict[str, str]:
     """What to type, and what each is for; how the netlist was compiled is among its facts."""
 
     def name(given: Any) -> str:
@@ -193,14 +194,14 @@ def _commands(request: ReportRequest, recording: str, bin_s: float | None) -> di
 
     net = name(request.netlist)
     checkpoint = name(request.checkpoint)
-    data = name(request.data)
+    data = SYNTHETIC if used.source.startswith(SYNTHETIC) else name(request.data)
     options = repeat.given(request, repeat.NETWORK)
     options |= {option: name(options[option]) or None for option in ("taxels", "edges")}
     model = repeat.words(options | {"polarities": request.polarities})
     if request.polarities_first is not None:
         model.append("--polarities-first" if request.polarities_first else "--polarities-last")
-    split = None if request.split == "test" else request.split
-    read = ["--data", data, *repeat.words({"split": split, "limit": request.limit, "bin": bin_s})]
+    split = None if used.split == "test" else used.split
+    read = ["--data", data, *repeat.words({"split": split, "limit": request.limit, "bin": used.bin_s})]
     spec = repeat.words({"spec_samples": None if request.spec_samples == 3 else request.spec_samples})
     both = [net, "--checkpoint", checkpoint, *model, *read]
     lines = {

@@ -1,5 +1,6 @@
 """How results and progress reach a terminal."""
 
+import errno
 import os
 import sys
 import time
@@ -47,6 +48,8 @@ def show(text: str) -> None:
     Control characters are escaped, letters that the terminal's encoding lacks become question marks.
     Raises OSError if the output cannot take the text, for example on a full disk.
     """
+    if sys.stdout is None:  # closed before we began
+        raise OSError(errno.EBADF, "is closed", "standard output")
     encoding = sys.stdout.encoding or "utf-8"
     try:
         sys.stdout.write(plain(text).encode(encoding, "replace").decode(encoding) + "\n")

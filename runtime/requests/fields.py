@@ -105,7 +105,10 @@ def _value(each: Field[Any], value: Any) -> Any:
     kind = kind_of(each)
     taken = _taken(kind, value)
     choices = each.metadata["choices"]
-    if taken is None and not hasattr(value, "populations") and not hasattr(value, "events"):
+    objects = {"Network": "populations", "Recordings": "events"}  # that some fields take as they are
+    if taken is None and not any(
+        kind in str(each.type) and hasattr(value, has) for kind, has in objects.items()
+    ):
         fault = f"{each.name} {reprlib.repr(value)}: {type(value).__name__} found"
         raise OptionError(f"{fault}, allowed: {ALLOWED.get(kind, kind)}; give one")
     if choices and not set(taken if kind == "tuple" else [taken]) <= set(choices):

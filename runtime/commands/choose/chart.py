@@ -1,6 +1,5 @@
 """The command ``chart``: accuracy against energy, time and size, for every configuration of a grid."""
 
-from functools import partial
 from pathlib import Path
 
 from spikeloom.compiler.errors import OptionError, require_least
@@ -76,4 +75,4 @@ def run(request: ChartRequest) -> Outcome:
         groups=groups_in(splits, request.groups),
     )
     write_chart(folder, charted)
-    return Outcome(charted, partial(printed, folder=str(folder)), 0 if charted.budget.fits else 1)
+    return Outcome(charted, printed, 0 if charted.budget.fits else 1)

@@ -9,7 +9,7 @@ from spikeloom.compiler.files import write_atomically
 from spikeloom.runtime.inputs.files import require_netlist, require_place
 from spikeloom.runtime.inputs.repeat import refuse
 from spikeloom.runtime.machines.backends import export_formats
-from spikeloom.runtime.report.encode import INLINE
+from spikeloom.runtime.report.encode import HIDDEN, INLINE
 from spikeloom.runtime.report.sections import Outcome, Section, Text
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.requests.exchange import ExportRequest
@@ -35,6 +35,8 @@ class Written(Shown):
     bytes: int
     sha256: str
     facts: Any = field(metadata=INLINE)
+    form: str | None = field(metadata=HIDDEN)
+    lines: tuple[str, ...] = field(metadata=HIDDEN)
 
 
 def _require_fit(request: ExportRequest) -> None:
@@ -62,16 +64,23 @@ def run(request: ExportRequest) -> Outcome:
             size += len(chunk)
             file.write(chunk)
     written = Written(
-        path=request.output, format=request.to, bytes=size, sha256=digest.hexdigest(), facts=export.facts
+        path=request.output,
+        format=request.to,
+        bytes=size,
+        sha256=digest.hexdigest(),
+        facts=export.facts,
+        form=export.form,
+        lines=tuple(export.lines),
     )
-
-    def sections(result: Written) -> Iterator[Section]:
-        where = "" if FORMATS[result.format].whole else " on the chip"
-        size = (
-            f"{result.facts.neurons} neurons{where} and {result.facts.synapses} synapses for {result.format}"
-        )
-        form = "" if export.form is None else f", form {export.form}"
-        lines = [f"{result.path}: {size}, {result.bytes} bytes{form}", *export.lines]
-        yield Section("", [Text(line) for line in lines])
-
     return Outcome(written, sections)
+
+
+def sections(written: Written) -> Iterator[Section]:
+    """What the file holds."""
+    where = "" if FORMATS[written.format].whole else " on the chip"
+    size = (
+        f"{written.facts.neurons} neurons{where} and {written.facts.synapses} synapses for {written.format}"
+    )
+    form = "" if written.form is None else f", form {written.form}"
+    lines = [f"{written.path}: {size}, {written.bytes} bytes{form}", *written.lines]
+    yield Section("", [Text(line) for line in lines])

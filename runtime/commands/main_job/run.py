@@ -10,7 +10,7 @@ import numpy as np
 from spikeloom.compiler.files import write_atomically
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.types import IntArray
-from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings
+from spikeloom.models.recordings.evtouch import UNLABELLED, Recordings, called
 from spikeloom.runtime.inputs.files import require_place
 from spikeloom.runtime.inputs.recordings import load_recordings
 from spikeloom.runtime.machines.backends import machine_for
@@ -102,7 +102,7 @@ def sections(found: Decisions) -> Iterator[Section]:
     names = found.class_names
 
     def named(label: int) -> str:
-        return str(label) if names is None else names[label]
+        return called(label, names)
 
     rows = list(
         zip(

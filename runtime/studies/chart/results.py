@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from spikeloom.runtime.report.encode import INLINE, OPTIONAL, key
+from spikeloom.runtime.report.encode import HIDDEN, INLINE, OPTIONAL, key
 from spikeloom.runtime.report.shown import Shown
 from spikeloom.runtime.studies.chart.grid import FEWEST, Grid
 from spikeloom.runtime.studies.chart.networks import NetworkFile, Storage
@@ -103,6 +103,7 @@ class Chart(Shown):
     points: tuple[Point, ...]
     refused: tuple[Refused, ...]
     budget: Pick
+    folder: str = field(metadata=HIDDEN)
     format: int = FORMAT
 
     @property

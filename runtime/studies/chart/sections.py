@@ -55,9 +55,9 @@ def sections(chart: Chart) -> list[Section]:
     ]
 
 
-def printed(chart: Chart, folder: str) -> list[Section]:
+def printed(chart: Chart) -> list[Section]:
     """The same for a terminal, with the place of the files."""
-    where = f"written: {folder}/chart.html, .svg, .png, .json; netlists in {folder}/netlists"
+    where = f"written: {chart.folder}/chart.html, .svg, .png, .json; netlists in {chart.folder}/netlists"
     return [*sections(chart), Section("", [Text(where)])]
 
 

@@ -104,6 +104,7 @@ def chart(
         points=tuple(points),
         refused=tuple(refused),
         budget=pick(points, budgets, by),
+        folder=str(folder),
     )
 
 
