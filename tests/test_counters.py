@@ -99,6 +99,8 @@ def test_a_counter_is_blocked_for_a_while_and_not_for_ever():
         events[sample, 0, 0, :ones] = 1
     spikes = run_counters(replace(data, held=events), Plan(thresholds=(3,))).spikes
     assert spikes[:, 0].tolist() == [1, 2, 4]
+    busy = recorded(np.ones((1, 1, 1, 40_000), np.uint8), np.zeros(1, np.int64))
+    assert run_counters(busy, Plan(thresholds=(1, 4))).spikes.tolist() == [[313, 306]]
 
 
 @pytest.mark.parametrize("plan", PLANS, ids=str)

@@ -8,7 +8,8 @@ from commands import as_json, run
 from oracles import refused
 
 from spikeloom.compiler.counters import BLOCK
-from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.errors import DataError, OptionError
+from spikeloom.models.recordings.events import joined_bins
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.runtime.commands.main_job import estimate
 from spikeloom.runtime.requests.main_job import EstimateRequest
@@ -48,6 +49,12 @@ def test_operations_and_decisions_are_those_of_a_plain_program(monkeypatch):
 
     def against(price):
         return processor.against_processor(training, test, 4, 0.02, price, np.ones(20, np.bool_))
+
+    bare = replace(test, held=np.zeros_like(test.events))
+    refused(DataError, "no events", processor.against_processor, training, bare, 4, 0.02, PRICE, None)
+    monkeypatch.setattr(processor, "PLANS", (((1, 4), 1), ((1, 2), 10)))
+    assert processor._rule(joined_bins(training, 4), 4).plan.parts == 1  # of 25 steps ten parts have none
+    monkeypatch.setattr(processor, "PLANS", (((1, 4), 1), ((1, 2), 5)))
 
     found = against(PRICE)
     work, chip, small = found.work, found.chip, found.processor

@@ -9,7 +9,7 @@ from commands import as_json, refusal, run
 from numpy.testing import assert_array_equal
 from oracles import refused
 
-from spikeloom.compiler.errors import OptionError
+from spikeloom.compiler.errors import DataError, OptionError
 from spikeloom.models.recordings.grasps import synthetic_split
 from spikeloom.models.training import folds, record
 from spikeloom.models.training.counters import Plan, counters_of, fit, run_counters
@@ -401,9 +401,71 @@ def test_conditions_are_left_out_in_turn(few):
     assert "left out in turn: hand=left, hand=right" in text
     assert "% where hand is new" in text
     assert "where all conditions are known it reaches" in text
+    other = {"left": "right", "right": "left", "hand": "hand"}
+    rows = [row.rsplit(",", 1) for row in table]
+    table = [f"{row},{hand if index % 5 else other[hand]}" for index, (row, hand) in enumerate(rows)]
+    (data / "recordings.csv").write_text("\n".join(table))
+    again = as_json(*words[:3], "--jobs", "1", "-o", "a.loom")  # takes nothing from the store
+    assert again["tried"][0]["conditions"] != found["tried"][0]["conditions"]
 
 
-@pytest.mark.usefixtures("few")
-def test_files_that_would_be_lost():
+def test_workers_number_classes_as_the_command_does(tmp_path):
+    for name in ("train/s_label_c", "test/s_label_a"):
+        (tmp_path / name).parent.mkdir()
+        np.save(tmp_path / f"{name}.npy", np.ones((2, 2, 9), np.uint8))
+    assert work._training_of(str(tmp_path), 2, 0.02, None, ("a", "c"), ("", "")).labels.tolist() == [1]
+
+
+def test_a_candidate_that_does_not_spike_is_refused_alone(few, monkeypatch):
+    tries = work.cross_validated
+
+    def silent(data, *about):
+        if data.plan.thresholds == (1,):
+            raise DataError("none of them spikes")
+        return tries(data, *about)
+
+    monkeypatch.setattr(work, "cross_validated", silent)
+    why = {each["name"]: each.get("refused") for each in as_json(*WORDS)["tried"]}
+    assert why["counters 1 join=10"] == "none of them spikes"
+    assert why["counters 1,4 join=10"] is None
+
+
+def test_a_condition_that_holds_all_other_classes(few):
+    sides = [folds.Fold(held=np.repeat(held, 2)) for held in ([True, False], [False, True])]
+    labels = np.array([0, 0, 1, 1])
+    assert baselines.decided(baselines.LINEAR, 1.0, np.eye(4), labels, sides).tolist() == [1, 1, 0, 0]
+
+
+def test_few_recordings_make_few_folds():
+    (parts,) = folds.folds_of(synthetic_split("train", limit=3), 1)
+    assert [int(part.held.sum()) for part in parts] == [1, 1, 1]
+
+
+def test_time_that_ends_before_anything_may_be_chosen_is_said(monkeypatch):
+    monkeypatch.setattr(study, "search", lambda *_: [POOL[4], replace(POOL[4], costs=None, refused="why")])
+    monkeypatch.setattr(study, "train_all", lambda *_: [])
+    refused(OptionError, "--time: was too short", study.try_all, [], [], 2, [], None, None, 10)
+
+
+def test_a_training_that_was_begun_for_another_choice_begins_anew(trained, monkeypatch):
+    resumed, train = [], smallest.train.run
+
+    def strange(request):
+        resumed.append(request.resume)
+        if request.resume:
+            raise OptionError("belongs to a training with other epochs")
+        return train(request)
+
+    monkeypatch.setattr(smallest.train, "run", strange)
+    (trained / "a.pt.state.whole").write_bytes(b"of another")
+    as_json(*WORDS)
+    assert resumed == [True, False]
+
+
+def test_files_that_would_be_lost(few):
+    (few / "a.training").mkdir()
+    (few / "a.training" / "own.csv").write_text("precious")
+    assert "a.training keeps trainings, and holds other files" in refusal(*WORDS)
+    assert (few / "a.training" / "own.csv").read_text() == "precious"
     for output in ("a.pt", "missing/a.loom"):
         assert f"-o {output}" in refusal("smallest", "--data", "synthetic", "-o", output)

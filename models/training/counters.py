@@ -97,7 +97,7 @@ class Counted:
     plan: Plan
     steps: int
     counter: IntArray  # (counters, 3) int64; see :class:`Counters`
-    spikes: NDArray[np.int8]  # (samples, counters); how often each has spiked in the end
+    spikes: NDArray[np.int16]  # (samples, counters); how often each has spiked in the end
     at: NDArray[np.int32]  # (samples, counters); step of the first spike, `steps` where there is none
     labels: IntArray
 
@@ -120,9 +120,10 @@ def run_counters(data: Recordings, plan: Plan, steps: int | None = None) -> Coun
         )
     rows = []
     kinds = []
+    counts: type[np.signedinteger[Any]] = np.int16 if length <= np.iinfo(np.int16).max else np.int32
     for part in range(plan.parts):
         first = part * length
-        total = np.cumsum(flat[..., first : first + length], axis=-1, dtype=np.int16)
+        total = np.cumsum(flat[..., first : first + length], axis=-1, dtype=counts)
         for threshold in plan.thresholds:
             fired = total >= threshold
             last = total[..., -1].astype(np.int64)
@@ -134,7 +135,7 @@ def run_counters(data: Recordings, plan: Plan, steps: int | None = None) -> Coun
         plan=plan,
         steps=steps,
         counter=np.array(kinds, np.int64).reshape(-1, 3),
-        spikes=np.concatenate([times for times, _ in rows], axis=1).astype(np.int8),
+        spikes=np.concatenate([times for times, _ in rows], axis=1).astype(np.int16),
         at=np.concatenate([when for _, when in rows], axis=1).astype(np.int32),
         labels=data.labels,
     )
@@ -354,7 +355,7 @@ def round_weights(weight: FloatArray, spikes: FloatArray, most: int) -> FloatArr
     return whole
 
 
-def counter_spikes(made: Counters, data: Counted) -> NDArray[np.int8]:
+def counter_spikes(made: Counters, data: Counted) -> NDArray[np.int16]:
     """How often each counter of a network has spiked in the end; (samples, counters)."""
     place = {tuple(each): index for index, each in enumerate(data.counter.tolist())}
     return data.spikes[:, [place[tuple(each)] for each in made.counter.tolist()]]

@@ -32,7 +32,7 @@ def folds_of(data: Recordings, rounds: int, *, at_random: bool = False) -> list[
         ]
     seeds = range(1, rounds + 1) if rounds > 1 else (0,)
     parts = [split_folds(data.labels, FOLDS, np.random.default_rng(seed)) for seed in seeds]
-    return [[Fold(held=fold == part) for part in range(FOLDS)] for fold in parts]
+    return [[Fold(held=fold == part) for part in np.unique(fold)] for fold in parts]
 
 
 def every(rounds: list[list[Fold]]) -> Iterator[Fold]:

@@ -18,6 +18,7 @@ from itertools import product
 import numpy as np
 
 from spikeloom.compiler.counters import Counters
+from spikeloom.compiler.errors import DataError
 from spikeloom.compiler.targets.base import Quantity
 from spikeloom.compiler.types import BoolArray, FloatArray
 from spikeloom.models.recordings.evtouch import Recordings
@@ -118,6 +119,10 @@ def against_processor(
     spikes = counter_spikes(rule, run_counters(test, plan, rule.steps)).astype(np.int64)
     ours = (spikes @ rule.weight.T).argmax(axis=1) == test.labels
     events = float(test.events.sum()) / len(test)
+    if not events:
+        raise DataError(
+            f"{test.source}: no events, so no rate of them to compare at; give recordings with some"
+        )
     seconds = float(test.step_counts.mean()) * bin_s
     channels = rule.taxels * rule.polarities
     added = float(spikes.sum()) / len(test) * rule.classes
@@ -181,9 +186,12 @@ def _rule(training: Recordings, bits: int) -> _Rule:
     classes = int(training.labels.max()) + 1
     rules = []
     progress = Progress(len(PLANS))
-    for done, (thresholds, parts) in enumerate(PLANS):
+    for done, (thresholds, most) in enumerate(PLANS):
         progress(done, "training rules for a processor")
-        plan = Plan(thresholds=thresholds, parts=min(parts, training.steps), bits=bits)
+        parts = min(most, training.steps)
+        if (parts - 1) * -(-training.steps // parts) >= training.steps:
+            continue  # the last part would have no step
+        plan = Plan(thresholds=thresholds, parts=parts, bits=bits)
         data = run_counters(training, plan)
         fitted = fit(data, classes)
         right = cross_validate(data, classes)[fitted.strength].argmax(axis=1) == data.labels

@@ -32,6 +32,7 @@ from spikeloom.runtime.requests.choose import SmallestRequest
 from spikeloom.runtime.requests.main_job import CompileRequest, VerifyRequest
 from spikeloom.runtime.requests.training import TrainRequest
 from spikeloom.runtime.studies.cluster import on_cluster
+from spikeloom.runtime.studies.jobs import content_key
 from spikeloom.runtime.studies.search.budgets import parse_budgets
 from spikeloom.runtime.studies.search.results import data_of, share
 from spikeloom.runtime.studies.smallest.results import Checked, Tried
@@ -44,6 +45,9 @@ from spikeloom.runtime.studies.training.plan import both_splits
 SENSOR = ("graph", "taxels", "edges", "directed")
 
 DEFAULT_TIME = "15m"
+
+STATE = re.compile(r"\.?[0-9a-f]{24}\.")
+"""Beginning of the names of states of trainings."""
 
 GRAPH = "manual"
 """Of the built-in sensor, unless another is named."""
@@ -92,7 +96,9 @@ def run(request: SmallestRequest) -> Outcome:
         groups=request.groups,
         sensor=sensor,
         target=request.target,
-        states=store.with_suffix(".training"),
+        states=_states(store.with_suffix(".training")),
+        conditions=content_key(dict(training.groups)),
+        classes=training.names,
     )
     found = smallest(
         list(counting(training.steps, request.levels or 1, bits)),
@@ -111,6 +117,17 @@ def run(request: SmallestRequest) -> Outcome:
         with write_atomically(request.html) as file:
             file.write(page(found).encode())
     return Outcome(found, sections, 0 if found.choice.fits else 1)
+
+
+def _states(folder: Path) -> Path:
+    """Folder for the states of trainings, which goes at the end; OptionError if it holds anything else."""
+    if folder.exists() and not (
+        folder.is_dir() and all(STATE.match(each.name) for each in folder.iterdir())
+    ):
+        raise OptionError(
+            f"--store: {folder} keeps trainings, and holds other files; move it, or give another store"
+        )
+    return folder
 
 
 def systems_of(target: Target, sensor: Sensor) -> tuple[str, ...]:
@@ -153,9 +170,16 @@ def _made(
     words |= {"verify": [netlist, "--checkpoint", network, *read], "estimate": [netlist, *read]}
     from spikeloom.models.training.train import state_files  # with torch
 
-    begun = not counts and any(file.exists() for file in state_files(Path(f"{network}.state")))
+    begun = [file for file in state_files(Path(f"{network}.state")) if file.exists() and not counts]
     try:
-        train.run(request_of(TrainRequest, [*trained, *(["--resume"] if begun else [])]))
+        try:
+            train.run(request_of(TrainRequest, [*trained, *(["--resume"] if begun else [])]))
+        except OptionError:
+            if not begun:
+                raise
+            for file in begun:  # of another choice
+                file.unlink()
+            train.run(request_of(TrainRequest, trained))
     except KeyboardInterrupt:
         raise KeyboardInterrupt("what was found is kept; go on with the same command") from None
     compile.run(request_of(CompileRequest, words["compile"]))

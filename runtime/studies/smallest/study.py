@@ -196,7 +196,8 @@ def try_all(
     tried = search(counters, partial(promote, budgets=budgets), scene, work_on, SHARES_OF_TIME[COUNTING])
     trained = train_all(networks, folds, budgets, scene, work_on, steps)
     tried += [replace(each, number=len(tried) + each.number) for each in trained]
-    if not any(each.rung >= RUNGS or each.refused for each in tried):
+    able = any(each.rung >= RUNGS and each.costs is not None for each in tried)
+    if not able and not (tried and all(each.refused for each in tried)):
         raise OptionError(
             "--time: was too short for any candidate; the same command goes on, give it longer"
         )

@@ -17,6 +17,7 @@ from spikeloom.compiler.formats.counters import SYSTEM as COUNTING
 from spikeloom.compiler.passes.calibrate import evenly_spaced
 from spikeloom.compiler.targets.base import load_target
 from spikeloom.compiler.types import BoolArray, FloatArray, IntArray, JsonObject
+from spikeloom.models.recordings.classes import renamed
 from spikeloom.models.recordings.events import joined_bins, of_length
 from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.counters import (
@@ -47,7 +48,7 @@ from spikeloom.runtime.studies.smallest.baselines import LINEAR, RBF, RIDGE
 from spikeloom.runtime.studies.smallest.space import MANY, Candidate, epochs_of
 from spikeloom.runtime.studies.smallest.trained import Sensor, plan_of, without
 
-FORMAT = 5
+FORMAT = 6
 """Of what is measured; goes up when a figure means something else."""
 
 PRICED = 48
@@ -78,6 +79,8 @@ class Scene:
     sensor: Sensor
     target: str
     states: Path
+    conditions: str  # Digest of the condition of each recording
+    classes: tuple[str, ...] | None  # Their names, where numbers alone do not say them
 
     @property
     def identity(self) -> JsonObject:
@@ -88,6 +91,7 @@ class Scene:
             "spikeloom": __version__,
             "data": self.data.sha256,
             "groups": self.groups,
+            "conditions": self.conditions,
             "bin_s": self.data.bin_s,
             "graph": arrays_digest(sensor),
             "target": self.target,
@@ -210,14 +214,22 @@ def _encoded(measured: Measured) -> JsonObject:
 
 
 @lru_cache(maxsize=1)
-def _training_of(path: str, taxels: int, bin_s: float, groups: str | None) -> Recordings:
+def _training_of(
+    path: str,
+    taxels: int,
+    bin_s: float,
+    groups: str | None,
+    classes: tuple[str, ...] | None,
+    _now: tuple[str, str],
+) -> Recordings:
     known: dict[str, Any] = {"taxels": taxels, "bin_s": bin_s, "groups": groups}
-    return recordings(path, "train", classes=None, labels_for="training", **known)
+    return renamed(recordings(path, "train", classes=None, labels_for="training", **known), classes)
 
 
 def _training(scene: Scene) -> Recordings:
     taxels = len(scene.sensor.graph.coordinates)
-    return _training_of(scene.data.path, taxels, scene.data.bin_s, scene.groups)
+    now = scene.data.sha256, scene.conditions  # other recordings at the same place are read again
+    return _training_of(scene.data.path, taxels, scene.data.bin_s, scene.groups, scene.classes, now)
 
 
 def some(data: Recordings) -> Recordings:
@@ -233,10 +245,16 @@ def _counting(work: Trial, training: Recordings) -> Measured:
     right = np.zeros(len(training), np.int64)
     shares: dict[str, float] = {}
     rounds = _rounds(work, training)
-    for folds in rounds:
-        decided, strength, lowest = cross_validated(data, classes, training, folds)
-        right += decided == training.labels
-        shares |= _by_condition(folds, decided == training.labels)
+    try:
+        for folds in rounds:
+            decided, strength, lowest = cross_validated(data, classes, training, folds)
+            right += decided == training.labels
+            shares |= _by_condition(folds, decided == training.labels)
+    except DataError as error:  # such as that no counter spikes without some of the recordings
+        none = (0,) * len(right)
+        return Measured(
+            right=none, tried=none, setting=work.setting or 0.0, refused=str(error).splitlines()[0]
+        )
 
     def compiled(data: Counted) -> tuple[Counters, Any]:
         rule = fit_rules(data, classes, [strength])[strength]

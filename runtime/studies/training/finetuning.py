@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -203,7 +204,7 @@ def _record(
     training, test = splits
     weights = WEIGHTS[0] if loaded.checkpoint is None else loaded.checkpoint.weights
     return FinetuneRecord(
-        command=" ".join(_words(request, SYNTHETIC if request.data == SYNTHETIC else training.source)),
+        command=shlex.join(_words(request, SYNTHETIC if request.data == SYNTHETIC else training.source)),
         fine_tuned_from=loaded.sha256,
         fine_tuned_weights=weights,
         weight_bits=widths or [form.bits for form in tuned.net.forms],

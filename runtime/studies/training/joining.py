@@ -1,5 +1,6 @@
 """Join trained networks into one whose votes add up."""
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -111,8 +112,8 @@ def _common_origin(towers: Sequence[Mapping[str, Any]]) -> JsonObject:
 def _command(request: JoinRequest) -> str:
     """The words that ask for the same."""
     words = [_shown(name) for name in request.checkpoints]
-    words += [f"--weights {request.weights}"] if request.weights else []
-    return f"spikeloom join {' '.join(words)}"
+    words += ["--weights", request.weights] if request.weights else []
+    return shlex.join(["spikeloom", "join", *words])
 
 
 def _network(name: str, weights: str | None) -> Checkpoint:

@@ -1,5 +1,6 @@
 """What a request to train asks for: the recipe, the sensor, the recordings, and a job for each seed."""
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -75,7 +76,7 @@ def plan_jobs(request: TrainRequest, training: Recordings, test: Recordings) -> 
     recipe = recipe_of(request)
     epochs = recipe.epochs if request.epochs is None else request.epochs
     data = SYNTHETIC if request.data == SYNTHETIC else training.source
-    command = " ".join(_words(request, {"data": data}, {"epochs": epochs}))
+    command = shlex.join(_words(request, {"data": data}, {"epochs": epochs}))
     plan = Plan(
         system=system,
         graph=graph,
