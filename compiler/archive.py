@@ -9,6 +9,7 @@ import io
 import json
 import math
 import os
+import sys
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -240,7 +241,7 @@ def _is_shallow(value: Any, depth: int) -> bool:
 def _is(value: Any, kind: Kind) -> bool:  # noqa: PLR0911 - one for each kind
     match kind:
         case type() if kind is float:
-            return type(value) in (int, float) and 0 <= value < math.inf
+            return type(value) in (int, float) and 0 <= value <= sys.float_info.max
         case type():
             return isinstance(value, kind) and not (isinstance(value, str) and len(value) > LETTERS)
         case tuple():

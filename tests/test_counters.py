@@ -179,6 +179,7 @@ def test_file_and_back(tmp_path):
         (lambda c: replace(c, taxels=0), "no usable taxels"),
         (lambda c: replace(c, taxels=2**20), "more than 1,048,576 channels"),
         (lambda c: replace(c, threshold=-1.0), "no usable threshold"),
+        (lambda c: replace(c, ramp=2**20), "more than 1,048,576 steps"),
         (lambda c: c, "does not match its hash|is truncated"),  # once a byte is another
     ],
 )

@@ -77,6 +77,15 @@ def test_any_network(data, exponents, length, gated, blank):
     assert_twins_agree(netlist, events, gated=gated, blank=blank)
 
 
+def test_any_number_but_zero_is_an_event():
+    netlist = large_netlist(7, proved=True)
+    events = (np.random.default_rng(0).random((2, netlist.n_inputs, 9)) < 0.3).astype(np.uint8)
+    prepared = engine.prepare(netlist)
+    wanted = engine.simulate(prepared, events).counts.spikes
+    for other in (events * 255, events * np.int64(256), events * 0.5):
+        assert_array_equal(engine.simulate(prepared, other).counts.spikes, wanted)
+
+
 def test_blank_steps_of_an_empty_recording_do_not_vote():
     netlist = large_netlist(7, proved=True)
     netlist = replace(netlist, layers=tuple(replace(layer, depth=0) for layer in netlist.layers))

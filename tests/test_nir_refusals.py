@@ -258,6 +258,14 @@ def test_a_process_that_ends_badly_is_noticed_where_nothing_forks(monkeypatch):
     assert not hdf5._ends_elsewhere(Path(GOOD).read_bytes())
 
 
+def test_words_count_as_long_as_they_are():
+    with h5py.File("words", "w", driver="core", backing_store=False) as file:
+        file.create_dataset("few", data=["a", "bc"], dtype=h5py.string_dtype())
+        file.create_dataset("long", data=["x" * 4000] * 30, dtype=h5py.string_dtype())
+        assert hdf5._entry(file, "few", [1000]) == ["a", "bc"]
+        oracles.refused(ModelError, "announces more than", hdf5._entry, file, "long", [100_000])
+
+
 def test_what_is_no_nir_file(tmp_path, monkeypatch):
     assert "no such file" in refused(read_nir, tmp_path / "other.nir", dt=1.0)
     monkeypatch.setattr(files, "SIZE_LIMIT", 1000)

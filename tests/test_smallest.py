@@ -431,7 +431,7 @@ def test_a_candidate_that_does_not_spike_is_refused_alone(few, monkeypatch):
 
 
 def test_a_condition_that_holds_all_other_classes(few):
-    sides = [folds.Fold(held=np.repeat(held, 2)) for held in ([True, False], [False, True])]
+    sides = [folds.Fold(held=np.repeat(side, 2)) for side in ([True, False], [False, True])]
     labels = np.array([0, 0, 1, 1])
     assert baselines.decided(baselines.LINEAR, 1.0, np.eye(4), labels, sides).tolist() == [1, 1, 0, 0]
 

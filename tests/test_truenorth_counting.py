@@ -116,6 +116,7 @@ def test_what_the_chip_cannot_hold_is_refused(tmp_path):
         compile_crossbars(counters)
     counters = random_counters(0)
     refused(ModelError, "a ramp of 0.5 a step", compile_crossbars, replace(counters, slope=0.5))
+    refused(ModelError, "no register holds", compile_crossbars, replace(counters, threshold=1e308))
     refused(
         CapacityError,
         "chip: 2 used, 1 allowed |--weight-bits",

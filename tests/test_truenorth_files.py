@@ -87,6 +87,7 @@ def test_numpy_alone_reads_it_and_a_reader_of_other_files_names_it(path):
         ({"feed_channel": np.array([0, 1, 2, 6], np.int8)}, "feed_channel has values outside 0 … 5"),
         ({"layer": np.array([0, 1], np.int8)}, "layer has values outside 0 … 0"),
         ({"manifest": {"bin_ticks": 0}}, "the manifest has no usable bin_ticks"),
+        ({"manifest": {"layers": []}}, "the manifest has no usable layers"),
         ({"manifest": {"clocks": {"channels": 0}}}, "the manifest has no usable clocks"),
         ({"manifest": {"target": "loihi1"}}, "is for 'loihi1', this program knows truenorth"),
         ({"manifest": {"version": 3}}, "has format version 3, this program reads 2"),

@@ -116,6 +116,8 @@ def _array_faults(sizes: Mapping[str, Any], counter: archive.Array, weight: arch
     """What in the arrays does not suit the sizes, or each other."""
     if sizes["taxels"] * sizes["polarities"] * sizes["parts"] > MOST:
         return [f"more than {MOST:,} channels of parts"]
+    if sizes["steps"] + sizes["ramp"] > MOST_STEPS:
+        return [f"more than {MOST_STEPS:,} steps, those of the read-out included"]
     if (
         (counter.dtype.kind, weight.dtype.kind) != ("i", "i")
         or counter.shape[1:] != (3,)

@@ -183,13 +183,26 @@ def _entry(group: Any, key: str, room: list[int]) -> Any:
     room[0] -= item.dtype.itemsize * max(item.size, int(np.prod(item.chunks or (0,), dtype=object)))
     if room[0] < 0:
         raise ModelError(f"announces more than {files.SIZE_LIMIT} bytes of numbers; {AGAIN}")
-    if item.dtype.kind == "S" or h5py.check_string_dtype(item.dtype) is not None:
+    if item.dtype.kind == "O" and h5py.check_string_dtype(item.dtype) is not None:
+        return _words(item, room)
+    if item.dtype.kind == "S":
         values = item[()]
         return _decoded(values.tolist() if isinstance(values, np.ndarray) else values)
     if item.dtype.kind not in "biuf" or item.dtype.itemsize > 8:
         return None
     values = np.asarray(item[()])
     return np.ascontiguousarray(values, values.dtype.newbyteorder("<")).reshape(values.shape)
+
+
+def _words(item: Any, room: list[int]) -> Any:
+    """Words of any length, one by one: many entries may point at one long word."""
+    words = np.empty(item.shape, object)
+    for index in np.ndindex(item.shape):
+        words[index] = word = _decoded(item[index])
+        room[0] -= len(word)
+        if room[0] < 0:
+            raise ModelError(f"announces more than {files.SIZE_LIMIT} bytes of numbers; {AGAIN}")
+    return words.tolist()
 
 
 def _decoded(value: Any) -> Any:

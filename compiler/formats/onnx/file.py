@@ -135,13 +135,16 @@ def _bring_data(graph: Any, folder: Path, digest: Any) -> None:
     for tensor in chain(graph.initializer, tensors):
         if tensor.data_location != tensor.EXTERNAL:
             continue
-        location = next((entry.value for entry in tensor.external_data if entry.key == "location"), "")
+        entries = {entry.key: entry.value for entry in tensor.external_data}
+        location, length = (entries.get(key, "") for key in ("location", "length"))
         with named(
             f"tensor {printable(_text(tensor.name))} in {printable(_text(location))!r} beside the file"
         ):
             if not (place := folder / _text(location)).is_file():  # onnx would wait for a pipe
                 raise FileFault("no such file")
-            total += place.stat().st_size
+            total += (
+                int(length) if length.isdecimal() else 0
+            ) or place.stat().st_size  # many may share a file
             require_size(total, "network")
             load_external_data_for_tensor(tensor, str(folder))
         digest.update(tensor.raw_data)

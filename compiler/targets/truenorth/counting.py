@@ -47,6 +47,9 @@ MAGNITUDES = tuple(1 << kind for kind in range(AXON_TYPES))
 
 LARGEST = sum(MAGNITUDES)
 
+MOST = 2**31
+"""No register holds a larger number."""
+
 Wanted = tuple[Neuron, int, Place, tuple[int, ...]]
 """A neuron, its number in the layer, the axon that it reaches, and its sources."""
 
@@ -81,6 +84,8 @@ def planned(counters: Counters, chip: Target) -> Plan:
         raise ModelError(
             f"weights of up to {most}, {LARGEST} allowed; train it with --weight-bits {bits} or fewer"
         )
+    if max(counters.threshold, counters.slope) > MOST:
+        raise ModelError(f"a threshold or ramp beyond {MOST:,}, which no register holds; train it again")
     if counters.slope != int(counters.slope):
         raise ModelError(f"a ramp of {counters.slope:g} a step, whole numbers are allowed; train it again")
     signed = np.stack([counters.weight, -counters.weight], axis=1).clip(min=0)

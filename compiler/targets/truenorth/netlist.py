@@ -195,6 +195,8 @@ def inconsistencies(netlist: CrossbarNetlist) -> list[str]:
     cores = netlist.n_cores
     neurons = netlist.n_neurons
     axons = netlist.n_axons
+    if not neurons:
+        return ["it has no neurons"]
     bounds = {
         "core_neurons": (cores, neurons),
         "core_axons": (cores, axons),
@@ -265,7 +267,7 @@ FILE = NetlistFile(
     version=2,
     targets=("truenorth",),
     netlist=CrossbarNetlist,
-    entries={"layers": [str], "bin_ticks": (1, MOST_TICKS), "bins": (1, MOST_STEPS)},
+    entries={"layers": [str, ...], "bin_ticks": (1, MOST_TICKS), "bins": (1, MOST_STEPS)},
     layer=str,
     inconsistencies=inconsistencies,
     tables=frozenset({"weight"}),

@@ -183,7 +183,9 @@ def simulate(
     ends = np.full(recordings, length) if lengths is None else np.asarray(lengths, np.int64)
     run_part, size = (_run_steps, 1) if engine.blocks is None else (_run_layers, PART)
     require_below("length", ends, length + 1)
-    given = np.ascontiguousarray(events).view(np.uint8)
+    given = np.ascontiguousarray(events if events.dtype in (np.uint8, np.bool_) else events != 0).view(
+        np.uint8
+    )
     given.flags.writeable = False  # or the kernels would be compiled twice, for either
     if charges is not None:
         sources = np.pad(charges.sources, ((0, 0), (0, -charges.sources.shape[1] % CHARGES)))

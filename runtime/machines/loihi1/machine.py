@@ -152,9 +152,9 @@ class Loihi(Damageable, Explainable, Stoppable):
 
     @property
     def read_out_lag(self) -> int:
-        """The depth of the latest layer that votes."""
+        """The depth of the latest layer that votes, 0 where none does."""
         voting = np.unique(self.netlist.layer[self.netlist.voters])
-        return max(int(self.netlist.layers[layer].depth) for layer in voting.tolist())
+        return max((int(self.netlist.layers[layer].depth) for layer in voting.tolist()), default=0)
 
     def in_a_row(self, events: EventArray | Stored, lengths: IntArray | None) -> IntArray | None:
         """Registers are carried over from one to the next."""

@@ -208,7 +208,7 @@ def simulate(
     merged = np.zeros(samples, np.int64)
 
     def one(sample: int) -> None:
-        arriving = np.ascontiguousarray(events[sample, :, : steps[sample]].T).astype(np.uint8)
+        arriving = np.ascontiguousarray(events[sample, :, : steps[sample]].T != 0).view(np.uint8)
         arrays = (axons, spiked, votes, overflows, raster, membranes_kept)
         merged[sample] = kernel.run(
             arriving,

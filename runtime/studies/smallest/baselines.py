@@ -77,11 +77,13 @@ def decided(
     """Class of each recording by a machine that did not see it."""
     found = np.empty_like(labels)
     for held in (fold.held for fold in folds):
-        if len(known := np.unique(labels[~held])) == 1:  # a condition may hold all others
-            found[held] = known
-            continue
-        fitted = machine(system, strength).fit(seen[~held], labels[~held])
-        found[held] = fitted.predict(seen[held])
+        others = labels[~held]
+        alike = (
+            len(np.unique(others)) == 1
+        )  # as where a condition holds all others, and nothing can be fitted
+        found[held] = (
+            others[0] if alike else machine(system, strength).fit(seen[~held], others).predict(seen[held])
+        )
     return found
 
 
