@@ -17,7 +17,7 @@ from spikeloom.compiler.errors import NumericRangeError
 from spikeloom.compiler.formats.counters import counting_network
 from spikeloom.compiler.interpret import vote
 from spikeloom.compiler.targets.base import load_target
-from spikeloom.compiler.targets.loihi1.netlist import read_netlist
+from spikeloom.compiler.targets.loihi1.netlist import read_netlist, write_netlist
 from spikeloom.compiler.targets.loihi1.passes import compile_network
 from spikeloom.models.recordings.events import load_data, of_length
 from spikeloom.models.recordings.grasps import synthetic_split
@@ -58,6 +58,13 @@ def report(as_json, place):
         found = as_json(*ALL, "--differ", "0.25", "-o", "all.json")
         assert json.loads((place / "all.json").read_text()) == found
     return json.loads((place / "all.json").read_text())
+
+
+def test_a_netlist_in_which_nobody_votes(as_json, place, monkeypatch):
+    monkeypatch.chdir(place)
+    netlist = read_netlist("net.loom")
+    write_netlist(replace(netlist, readout_class=0 * netlist.readout_class - 1), "mute.loom")
+    assert as_json("anytime", "mute.loom", "--data", "data", "--limit", "2")["rules"]
 
 
 def test_all_figures_of_a_stopped_chip(report, place, monkeypatch):

@@ -333,6 +333,12 @@ def test_a_full_disk_behind_standard_output(spikeloom, monkeypatch, capsys):
     )
 
 
+@pytest.mark.parametrize("words", [["--print-completion"], ["--print-completion", "fish"]])
+def test_completion_is_for_some_shells(capsys, words):
+    assert cli.main(words) == 2
+    assert "--print-completion: give one of bash, zsh, tcsh" in capsys.readouterr().err
+
+
 def test_a_closed_standard_output(spikeloom, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stdout", None)
     assert cli.main(["inspect", "net.loom"]) == 2

@@ -330,6 +330,12 @@ def test_an_interrupt_anywhere_leaves_nothing_half_written(tmp_path):
     assert struck > 0.9 * lines
 
 
+@pytest.mark.parametrize("value", [10**400, float("inf"), -1.0, "1", True], ids=lambda each: str(each)[:9])
+def test_what_is_no_real_number_of_a_manifest(value):
+    assert archive._is(0.5, float)
+    assert not archive._is(value, float)
+
+
 def test_leftovers_are_those_of_one_file(tmp_path):
     path = tmp_path / "x[1].json"
     with write_atomically(path) as file:

@@ -159,7 +159,7 @@ def test_budgets_that_are_none():
     timeless = replace(POOL[0], costs=replace(POOL[0].costs, time_s={}))
     with pytest.raises(OptionError, match="no time table"):
         study.pick([timeless], budgets("time=5ms"))
-    with pytest.raises(OptionError, match="holds no candidate; the first: too large"):
+    with pytest.raises(OptionError, match="no candidate can be had; the first, counters 1: too large"):
         study.pick([replace(POOL[0], costs=None, refused="too large")], ())
 
 
@@ -447,19 +447,13 @@ def test_time_that_ends_before_anything_may_be_chosen_is_said(monkeypatch):
     refused(OptionError, "--time: was too short", study.try_all, [], [], 2, [], None, None, 10)
 
 
-def test_a_training_that_was_begun_for_another_choice_begins_anew(trained, monkeypatch):
-    resumed, train = [], smallest.train.run
-
-    def strange(request):
-        resumed.append(request.resume)
-        if request.resume:
-            raise OptionError("belongs to a training with other epochs")
-        return train(request)
-
-    monkeypatch.setattr(smallest.train, "run", strange)
-    (trained / "a.pt.state.whole").write_bytes(b"of another")
-    as_json(*WORDS)
-    assert resumed == [True, False]
+def test_a_training_that_is_not_of_this_choice_is_left_alone(trained):
+    state = trained / "a.pt.state.whole"
+    state.write_bytes(b"weeks of work")
+    assert "a.pt.state.whole: is no training state, or was altered; delete it and train anew" in refusal(
+        *WORDS
+    )
+    assert state.read_bytes() == b"weeks of work"
 
 
 def test_files_that_would_be_lost(few):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import sqlite3
 import subprocess
@@ -145,6 +146,12 @@ def test_interrupted_it_says_what_is_kept_and_resumes_to_the_same_bytes(data):
     as_json(*WORDS, *words, "--resume")
     as_json(*WORDS, "--epochs", "8", "-o", "whole.pt")
     assert Path("x.pt").read_bytes() == Path("whole.pt").read_bytes()
+
+
+def test_the_command_that_is_remembered_can_be_typed(data):
+    (data / "data").rename(data / "my data")
+    (run,) = as_json("train", "--data", "my data", *WORDS[3:], "--epochs", "1", "-o", "x.pt")["runs"]
+    assert shlex.split(run["command"])[:4] == ["spikeloom", "train", "--data", "my data"]
 
 
 def test_one_process_works_on_a_file(data):
@@ -318,6 +325,16 @@ def test_an_interrupt_keeps_all(tmp_path):
     said = r"2 of 3 measurements of this stage are kept in .*; go on with the same command"
     with pytest.raises(KeyboardInterrupt, match=said):  # a note
         swept_here(tmp_path, points(tmp_path / "log", 3, trouble={2: "interrupt"}), jobs=1)
+
+
+def test_where_nothing_can_be_locked_it_is_said(tmp_path, monkeypatch, capsys):
+    def without(*_, **__):
+        raise NotImplementedError
+
+    monkeypatch.setattr("filelock.FileLock.acquire", without)
+    with only_one(tmp_path / "x.pt"):
+        pass
+    assert "x.pt: its file system has no locks" in capsys.readouterr().err
 
 
 def test_what_is_refused(tmp_path):

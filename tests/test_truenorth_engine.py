@@ -137,6 +137,15 @@ def large():
     return draft.netlist(taxels=39, polarities=2, classes=3)
 
 
+@pytest.mark.parametrize("scale", [np.uint8(255), np.int64(256), 0.5])
+def test_any_number_but_zero_is_an_event(scale):
+    netlist = made(relays())
+    events = np.ones((netlist.n_inputs, 5), np.uint8)
+    assert (
+        both(netlist, events * scale).counts.spikes.tolist() == both(netlist, events).counts.spikes.tolist()
+    )
+
+
 def test_full_cores_and_many_ticks():
     netlist, recording = large(), sparse_events(1, 78, 60, rate=0.05)
     assert faults(netlist, CHIP) == ()

@@ -33,13 +33,18 @@ def si(value: float, unit: str) -> str:
 
 
 def dominant(static_j: Iterable[float], dynamic_j: Iterable[float]) -> str:
-    """Which term of a decision is the larger at the pace of a sensor, by any source; joules."""
+    """Which term of a decision is the larger at the pace of a sensor, by any source; joules.
+
+    >>> dominant([0.1, 0.3], [0.001, 0.002]), dominant([0.1], [0.0])  # doctest: +NORMALIZE_WHITESPACE
+    ("at the sensor's pace static power dominates: 100 mJ to 300 mJ, 50 times the dynamic energy or more",
+     "at the sensor's pace static power dominates: 100 mJ to 100 mJ")
+    """
     least, *_, most = sorted([*static_j] * 2)
     high = max(dynamic_j)
     static = f"{si(least, 'J')} to {si(most, 'J')}"
     if least <= high:
         return f"at the sensor's pace dynamic energy is {si(high, 'J')}, static {static}"
-    more = f"{static}, {least / high:,.0f} times the dynamic energy or more"
+    more = f"{static}, {least / high:,.0f} times the dynamic energy or more" if high else static
     return f"at the sensor's pace static power dominates: {more}"
 
 

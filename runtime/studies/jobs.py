@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 
 from spikeloom.compiler.errors import DataError, OptionError, SpikeloomError, UnfinishedError, require_least
 from spikeloom.compiler.files import WRITTEN, FileFault, reading, remove_leftovers, require_size
-from spikeloom.runtime.report.console import Progress
+from spikeloom.runtime.report.console import Progress, tell
 from spikeloom.runtime.report.encode import decode
 from spikeloom.runtime.studies.cluster import cluster, one_thread, spread
 
@@ -264,6 +264,7 @@ def only_one(output: Path) -> Iterator[None]:
             f"{output}: another process is working on it; wait for it, or give another output"
         ) from None
     except NotImplementedError:  # a network's file system without locks
+        tell(f"warning: {output}: its file system has no locks; start no second process on it")
         yield
         return
     try:

@@ -170,16 +170,9 @@ def _made(
     words |= {"verify": [netlist, "--checkpoint", network, *read], "estimate": [netlist, *read]}
     from spikeloom.models.training.train import state_files  # with torch
 
-    begun = [file for file in state_files(Path(f"{network}.state")) if file.exists() and not counts]
+    begun = not counts and any(file.exists() for file in state_files(Path(f"{network}.state")))
     try:
-        try:
-            train.run(request_of(TrainRequest, [*trained, *(["--resume"] if begun else [])]))
-        except OptionError:
-            if not begun:
-                raise
-            for file in begun:  # of another choice
-                file.unlink()
-            train.run(request_of(TrainRequest, trained))
+        train.run(request_of(TrainRequest, [*trained, *(["--resume"] if begun else [])]))
     except KeyboardInterrupt:
         raise KeyboardInterrupt("what was found is kept; go on with the same command") from None
     compile.run(request_of(CompileRequest, words["compile"]))

@@ -44,7 +44,7 @@ def sections(result: Smallest) -> Iterator[Section]:
     lines = [f"dropped before the last rung: {number(len(dropped), 'candidate')}"]
     if refused := [each for each in result.tried if each.refused]:
         first = f"{refused[0].candidate.name}: {refused[0].refused}"
-        lines.append(f"the chip does not hold {number(len(refused), 'candidate')}; the first is {first}")
+        lines.append(f"{number(len(refused), 'candidate')} cannot be had; the first is {first}")
     blocks: list[Block] = [
         _table(result, last, "Candidates of the last rung, cheapest first, then baselines"),
         Text("\n".join(lines)),

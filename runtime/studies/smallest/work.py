@@ -125,7 +125,7 @@ class Measured:
     conditions: Mapping[str, float] = field(default_factory=dict)
     costs: NetlistCosts | None = field(default=None, metadata=OPTIONAL)
     whole: NetlistCosts | None = field(default=None, metadata=OPTIONAL)
-    refused: str | None = field(default=None, metadata=OPTIONAL)  # Why the chip does not hold it
+    refused: str | None = field(default=None, metadata=OPTIONAL)  # Why it cannot be had
     processor: Processor | None = field(default=None, metadata=OPTIONAL)  # Costs of a baseline
     certified: float | None = field(
         default=None, metadata=OPTIONAL
