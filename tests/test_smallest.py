@@ -159,7 +159,7 @@ def test_budgets_that_are_none():
     timeless = replace(POOL[0], costs=replace(POOL[0].costs, time_s={}))
     with pytest.raises(OptionError, match="no time table"):
         study.pick([timeless], budgets("time=5ms"))
-    with pytest.raises(OptionError, match="no candidate can be had; the first, counters 1: too large"):
+    with pytest.raises(OptionError, match="no candidate can be had; counters 1: too large"):
         study.pick([replace(POOL[0], costs=None, refused="too large")], ())
 
 

@@ -398,9 +398,7 @@ def pick(tried: Sequence[Tried], budgets: Sequence[Budget]) -> Choice:
     """
     priced = [each for each in tried if each.costs is not None]
     if not priced:
-        raise OptionError(
-            f"no candidate can be had; the first, {tried[0].candidate.name}: {tried[0].refused}"
-        )
+        raise OptionError(f"no candidate can be had; {tried[0].candidate.name}: {tried[0].refused}")
     pool = [each for each in priced if each.rung >= RUNGS]
     selection = choose(pool, values, worse, budgets)
     if not selection.fitting:
