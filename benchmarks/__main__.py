@@ -37,6 +37,7 @@ ROOT, RESULTS = HERE.parent, HERE / "results"
 RUNS = RESULTS / "runs"
 SHARED = Path(os.environ.get("SPIKELOOM_SHARED", ROOT.parent / "shared"))
 SOURCES = (SHARED / "data", SHARED / "data" / "silicon", SHARED / "checkpoints")
+WORK, FINISHED = "work", "*.parts.json"  # What studies go on from: a run again does all of it
 SAID = {"command", "spikeloom", "seconds"}  # Of a run, and not of what came out
 
 
@@ -110,11 +111,11 @@ def depends(log: Path, place: Path, began: int) -> dict[str, dict[str, str]]:
 
 def run(name: str, place: Path, sources: list[Path]) -> dict[str, Any]:
     """Run what made a result in an empty folder, and give its record; it is in ``benchmarks/results`` there."""
-    shutil.copytree(HERE, place / "benchmarks")
+    shutil.copytree(HERE, place / "benchmarks", ignore=shutil.ignore_patterns(FINISHED))
     for folder in ("docs", "examples", "tests"):
         (place / folder).symlink_to(ROOT / folder)
     (place / "FOLDER").mkdir()
-    for file in [file for folder in sources for file in folder.resolve().iterdir()]:
+    for file in [file for folder in sources for file in folder.resolve().iterdir() if file.name != WORK]:
         for link in {file.name, f"FOLDER/{file.name}", file.name.removeprefix("Ev-").lower()}:
             (place / link).symlink_to(file)
     results = place / "benchmarks" / "results"

@@ -181,6 +181,31 @@ def test_results_come_out_again(stored, name):
     assert stored.again(name) == []
 
 
+def test_a_run_again_finds_nothing_that_was_finished_before(stored, tmp_path, monkeypatch):
+    name, here, files, place = "longer-bins.json", tmp_path / "here", tmp_path / "files", tmp_path / "place"
+    for file in (
+        here / "results" / name,
+        here / "results" / "x.parts.json",
+        files / "work" / "1.json",
+        files / "a.pt",
+    ):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    seen = set()
+
+    def stop(*_, cwd, **__):
+        seen.update(file.name for file in cwd.rglob("*"))
+        raise RuntimeError("before it begins")
+
+    monkeypatch.setattr(stored, "HERE", here)
+    monkeypatch.setattr(stored.subprocess, "run", stop)
+    place.mkdir()
+    with pytest.raises(RuntimeError, match="before it begins"):
+        stored.run(name, place, [files])
+    assert "a.pt" in seen
+    assert seen.isdisjoint({"work", "1.json", "x.parts.json"})
+
+
 def test_what_a_run_wrote_is_none_of_its_sources(stored, tmp_path):
     (tmp_path / "benchmarks").mkdir()
     file = tmp_path / "benchmarks" / "made.py"
