@@ -153,6 +153,30 @@ def test_a_silent_recording_of_any_kind(tmp_path):
     assert found.groups == {}
 
 
+def test_two_tables_say_what_one_does_not(write):
+    for name in ("test/a.csv", "test/b.csv", "train/b.csv"):
+        write(f"own/{name}", f"{HEADER}0,0,1\n0.1,0,1\n")
+    write("own/labels.csv", "file,label\ntest/b.csv,1\nb.csv,3\na.csv,2\n")
+    folder = write(
+        "own/test/recordings.csv", "file,duration_s,hand\na.csv,0.2,left\nb.csv,0.3,right\n"
+    ).parents[1]
+    found = load_data(folder, split="test")
+    assert found.labels.tolist() == [2, 1]  # the row of a path before that of a name
+    assert (found.step_counts.tolist(), found.groups) == ([10, 15], {"hand": ("left", "right")})
+    write("own/test/labels.csv", "file,label\na.csv,2\nb.csv,5\n")
+    words = "own: test/labels.csv: test/b.csv: label is '5' here and '1' in another table; keep one of them"
+    assert refused(DataError, "", load_data, folder, split="test") == words
+
+
+def test_a_row_with_more_cells_than_its_table(write):
+    write("own/a.csv", f"{HEADER}0,0,1\n")
+    folder = write("own/labels.csv", "file,duration_s\na.csv,1,5\n").parent
+    words = "own: labels.csv: row 2: ['a.csv', '1', '5']; give a file, and one value in each column"
+    assert refused(DataError, "", load_data, folder) == words
+    write("own/labels.csv", "file,duration_s\na.csv,1,\n")
+    assert load_data(folder).step_counts.tolist() == [50]
+
+
 @pytest.mark.parametrize(
     ("seconds", "said"),
     [

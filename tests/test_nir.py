@@ -1,6 +1,7 @@
 """NIR files: held to what their own packages run, node by node; written ones opened by the package nir."""
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import nir
@@ -370,6 +371,16 @@ def test_what_a_netlist_exports_compiles_to_its_own_integers(name, tmp_path):
         assert_array_equal(ours.threshold, theirs.threshold)
         assert_array_equal(ours.bias, theirs.bias)
         assert (ours.decay_u, ours.decay_v) == (theirs.decay_u, theirs.decay_v)
+
+
+def test_layers_that_are_called_as_synapses_would_be(tmp_path):
+    network = network_chain(np.full((2, 2), 0.3), np.full((2, 2), 0.4))
+    names = ("x", "input_to_x")
+    populations = [replace(one, name=name) for one, name in zip(network.populations, names, strict=True)]
+    netlist = compile_network(replace(network, populations=tuple(populations))).netlist
+    path = tmp_path / "net.nir"
+    path.write_bytes(nir_export.export(lift(netlist), 0.02))
+    assert [one.name for one in read_nir(path).network.populations] == [*names]
 
 
 def test_relays_of_clocks_come_back_as_relays(tmp_path):

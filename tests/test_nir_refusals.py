@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+import tracemalloc
 from itertools import pairwise
 from pathlib import Path
 
@@ -201,6 +202,31 @@ def test_time_steps(tmp_path):
     oracles.refused(OptionError, "no time step, but its r is tau / 0.0001", read_nir, GOOD)
     nir.write(tmp_path / "a.nir", two_layers())
     oracles.refused(OptionError, "NIR keeps no time step; give --dt SECONDS", read_nir, tmp_path / "a.nir")
+
+
+@pytest.mark.parametrize("stated", [-1.0, np.nan, True])
+def test_a_file_that_states_no_time_step(tmp_path, stated):
+    graph = two_layers()
+    graph.metadata = {"dt": stated}
+    nir.write(tmp_path / "a.nir", graph)
+    words = f"states steps of {stated} s, which are none; export it again"
+    for given in (None, 0.02):
+        assert words in refused(read_nir, tmp_path / "a.nir", dt=given)
+
+
+def test_sizes_are_limited_before_memory_is_taken():
+    """A window of the padding's size, and a matrix for each of many rows."""
+    window = nir.SumPool2d(np.array([2**14, 2**14]), np.array([1, 1]), np.array([2**13, 2**13]))
+    rows = np.ones((2**14, 1))
+    large = [
+        graph_with({"a": window, "b": lif(4)}, [("a", "b")], (1, 2, 2), (4,)),
+        graph_with({"a": nir.Linear(rows), "b": lif(4)}, [("a", "b")], (2**14, 1), (4,)),
+    ]
+    tracemalloc.start()
+    for graph in large:
+        assert "weights once written out" in refused(lowered, graph, polarities=1)
+    assert tracemalloc.get_traced_memory()[1] < 2**26
+    tracemalloc.stop()
 
 
 def nested(file):

@@ -41,6 +41,7 @@ MORE = {
     "betas": np.array([0.1, 0.2, 0.3], np.float32),
     "big": np.array([10**12, 1]),
     "thetas": np.array([0.5, 0.5, 1.0], np.float32),
+    "yes": np.array(True),
     "v": np.arange(9, dtype=np.float32).reshape(3, 3),
 }
 
@@ -70,6 +71,16 @@ def looped():
     return model([scan], [("events", [3, 4])], ["end0"])
 
 
+def sparse_weights():
+    """A layer whose weights are a sparse tensor."""
+    proto = ModelProto.FromString(layer(GOOD))
+    weights = proto.graph.initializer[0]
+    places = helper.make_tensor("", TensorProto.INT64, [12], range(12))
+    proto.graph.sparse_initializer.append(helper.make_sparse_tensor(weights, places, [4, 3]))
+    del proto.graph.initializer[0]
+    return proto.SerializeToString()
+
+
 BRAIN = helper.make_tensor("w", TensorProto.BFLOAT16, (4, 3), [1] * 12)
 STAGES = [
     (f"node stage (Relu): {AFFINE}", "stage = Relu(current)"),
@@ -96,6 +107,7 @@ NODES = [
         "node stage (Strange): is of the domain my.own, allowed are the",
         helper.make_node("Strange", ["current"], ["stage"], domain="my.own"),
     ),
+    (f"node stage (Dropout): {AFFINE}", node("Dropout", "current one yes", "stage")),
 ]
 KEEPS = "k = Mul(u0, beta); m = Add(k, current)"
 AFTER = f"{KEEPS}; hot = Greater(m, theta); s0_new = Cast(hot)"
@@ -109,6 +121,25 @@ RESETS = [
     ("u0_new (Add)", f"low = Greater(u0, theta); y = Sub(u0, theta); z = Where(low, y, u0); {BEFORE}"),
 ]
 """Resets after the spike or before the next step that are none to zero: which operator is named."""
+
+ZEROED = (
+    f"q = Greater(u0, theta); d = Mul(u0, beta); k = Where(q, zero, d); u0_new = Add(k, current); {FIRE}"
+)
+COUNTS = [
+    ("m = Mul(n0, beta); n = Add(m, s0_new)", [("n0", [1, 3])]),
+    ("n = Sub(s0_new, n0)", [("n0", [1, 3])]),
+    ("n = Add(s0_new, u0)", []),
+    ("m = MatMul(x, w); n = Add(m, s0_new)", []),
+]
+"""Sums of spikes and of what is no running count of them."""
+
+
+def old_pad():
+    """A layer on a padded input, as before its sizes were an operand."""
+    padded = node("Pad", "wide", "padded", pads=[0, 1, 0, 1])
+    every = [padded, node("Gemm", "padded w b", "current"), *neuron(0, "current")]
+    return model(every, [("wide", [1, 2]), *STATE_IN[:2]], ["s0_new", "u0_new"], opset=10)
+
 
 NEURONS = [
     (
@@ -156,6 +187,23 @@ REFUSED = [
         "node u0_new (Add): has coefficients that are not finite",
         layer(GOOD, w=np.full((4, 3), np.nan, np.float32)),
     ),
+    (
+        "all inputs hold 2 recordings; export it with a batch of 1",
+        layer(GOOD, inputs=[(name, [2, *shape[1:]]) for name, shape in INPUTS]),
+    ),
+    (
+        "s0_new: ArgMax along axis 0 of [1, 3] is no decision",
+        layer(f"{GOOD}; class = ArgMax(s0_new)", outputs=["class", "u0_new", "s0_new"]),
+    ),
+    *[
+        (
+            "none counts the spikes of the last layer",
+            layer(f"{ZEROED}; {sums}", [*INPUTS[:2], *more], ["n", "u0_new"]),
+        )
+        for sums, more in COUNTS
+    ],
+    ("node padded (Pad): is the Pad of operators before version 11", old_pad()),
+    ("keeps constants as sparse tensors, which are not read", sparse_weights()),
     ("node end0 (Scan): holds a graph, a loop or a choice", looped()),
     # files
     ("holds no graph, so it is not an ONNX file", b""),

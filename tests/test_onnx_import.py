@@ -10,7 +10,20 @@ import numpy as np
 import pytest
 import torch
 from made_modules import NETS, AllSteps, example_of, exported, one_step
-from made_onnx import BIAS, FIRES, SECOND, STAGE, STATE_IN, WEIGHTS, fire, model, neuron, node, two_layers
+from made_onnx import (
+    BIAS,
+    FIRES,
+    SECOND,
+    STAGE,
+    STATE_IN,
+    WEIGHTS,
+    fire,
+    model,
+    neuron,
+    node,
+    two_layers,
+    written,
+)
 from onnx import helper
 from onnx.reference import ReferenceEvaluator
 from oracles import assert_same_network, refused
@@ -99,6 +112,27 @@ def test_how_spikes_are_counted(read, last, inputs, label):
     network = read(model(nodes, [("x", [1, 4]), *STATE_IN[:2], *inputs], outputs, votes)).network
     assert network.readout.label.tolist() == label
     assert network.classes == max(label) + 1
+
+
+def test_a_difference_from_the_threshold_in_every_step(read):
+    """Of the last step nothing but the difference is used, so that there it is the membrane."""
+    nodes = []
+    for step in range(3):
+        nodes += [
+            node("Gather", f"x step{step}", f"x{step}", axis=0),
+            node("Gemm", f"x{step} w b", f"c{step}"),
+        ]
+        kept = f"d{step} = Mul(u{step - 1}, beta); r{step} = Mul(d{step}, s{step - 1}); k{step} = Sub(d{step}, r{step})"
+        sums = f"{kept}; u{step} = Add(k{step}, c{step})" if step else "u0 = Identity(c0)"
+        nodes += written(
+            f"{sums}; v{step} = Sub(u{step}, theta); h{step} = Greater(v{step}, zero); s{step} = Cast(h{step})"
+        )
+    nodes.append(node("Sum", "s0 s1 s2", "votes"))
+    steps = {f"step{step}": np.array(step) for step in range(3)}
+    for outputs in (["votes"], ["votes", "u2"]):
+        network = read(model(nodes, [("x", [3, 1, 4])], outputs, steps)).network
+        assert [(p.size, p.beta, p.theta) for p in network.populations] == [(3, 0.2, 0.5)]
+        np.testing.assert_allclose(network.populations[0].bias, BIAS, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -274,6 +308,7 @@ CASES = [
     ("Einsum", [numbers(2, 3), numbers(3, 4)], {"equation": "ij,jk->ki"}),
     ("Einsum", [numbers(2, 3, 3), numbers(3)], {"equation": "bij,j->bi"}),
     ("Einsum", [numbers(2, 3)], {"equation": "ij->ji"}),
+    ("Einsum", [numbers(2, 3), numbers(3, 4)], {"equation": "bi,Io->bo"}),
     (
         "Conv",
         [numbers(1, 2, 5, 4), numbers(3, 2, 3, 2), numbers(3)],
@@ -291,6 +326,7 @@ CASES = [
     ("BatchNormalization", [numbers(2, 3, 4), *[abs(numbers(3)) for _ in range(4)]], {"epsilon": 0.25}),
     ("ReduceSum", [numbers(2, 3, 4), whole(0, -1)], {"keepdims": 0}),
     ("ReduceMean", [numbers(2, 3, 4), whole(1)], {}),
+    ("ReduceSum", [numbers(2, 3)], {"noop_with_empty_axes": 1}),
     ("Reshape", [numbers(2, 6), whole(0, 2, -1)], {}),
     ("Flatten", [numbers(2, 3, 4)], {"axis": 2}),
     ("Squeeze", [numbers(1, 3, 1), whole(0)], {}),

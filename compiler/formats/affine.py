@@ -175,7 +175,7 @@ def convolution(
 
 def block_diagonal(matrix: Sparse, copies: int) -> Sparse:
     """Block-diagonal matrix of so many copies of one; ModelError if it would be too large."""
-    _require_few(copies * matrix.nnz)
+    _require_few(copies * max(matrix.nnz, *matrix.shape))
     return (
         matrix
         if copies == 1

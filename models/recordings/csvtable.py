@@ -214,8 +214,8 @@ def _read_rows(opener: Callable[[], IO[Any]], where: str) -> dict[str, Row] | No
         here = f"{where}: row {line}"
         groups = dict(zip(header, (cell.strip() for cell in cells), strict=False))
         name = groups.pop(header[files[0]])
-        if not name or len(cells) < len(header):
-            raise DataError(f"{here}: {cells[:4]}; give a file, and a value in each column")
+        if not name or len(cells) < len(header) or any(cell.strip() for cell in cells[len(header) :]):
+            raise DataError(f"{here}: {cells[:4]}; give a file, and one value in each column")
         row = Row(
             label=_class(groups.pop(classes[0]), here) if classes else None,
             duration_s=_seconds(groups.pop(DURATION, ""), here),
@@ -271,14 +271,33 @@ def rows_beside(members: Members, files: Sequence[str], source: str) -> Listed:
                 continue
             inside = [file for file in files if PurePosixPath(file).is_relative_to(folder)]
             found = {file: row for file in inside for row in _rows_of(rows, PurePosixPath(file), folder)}
-            known |= found
+            known |= {
+                file: _merged(known.get(file, NOTHING), row, f"{where}: {file}")
+                for file, row in found.items()
+            }
             classes |= {row.label for row in rows.values() if row.label is not None}
             if len(found) < len(files):
                 notes.append(f"{where}: describes {len(found)} of {len(files)} recordings")
     return Listed(rows=known, classes=frozenset(classes), notes=notes)
 
 
+def _merged(known: Row, row: Row, where: str) -> Row:
+    """What two tables say of a recording; DataError if they contradict each other."""
+    first, second = (
+        {"label": each.label, DURATION: each.duration_s, **each.groups} for each in (known, row)
+    )
+    for name in first.keys() & second.keys():
+        if None not in (first[name], second[name]) and first[name] != second[name]:
+            words = f"{name} is {second[name]!r} here and {first[name]!r} in another table"
+            raise DataError(f"{where}: {words}; keep one of them")
+    return Row(
+        label=known.label if row.label is None else row.label,
+        duration_s=known.duration_s if row.duration_s is None else row.duration_s,
+        groups=known.groups | row.groups,
+    )
+
+
 def _rows_of(rows: Mapping[str, Row], file: PurePosixPath, folder: PurePosixPath) -> list[Row]:
-    """The row of a recording, by its name or its path from the table, if there is one."""
-    names = (file.name, file.relative_to(folder).as_posix())
+    """The row of a recording, by its path from the table or else its name, if there is one."""
+    names = (file.relative_to(folder).as_posix(), file.name)
     return [rows[name] for name in names if name in rows][:1]

@@ -77,8 +77,10 @@ def _stated(graph: Graph, name: str) -> float | None:
 
 
 def stated_step(graph: Graph) -> float | None:
-    """Seconds of a step, where the metadata of a file say so."""
+    """Seconds of a step, where the metadata of a file say so; ModelError if that is none."""
     dt = _stated(graph, "dt")
+    if dt is not None and not (type(dt) in (int, float) and 0 < dt < math.inf):
+        raise ModelError(f"states steps of {dt} s, which are none; export it again")
     return None if dt is None else float(dt)
 
 
@@ -278,7 +280,8 @@ def _pool(node: Node, value: Value, _steps: Steps) -> Value:
     if min(kernel) < 1 or max(kernel) > max(shape) + 2 * max(max(pair) for pair in padding):
         raise node.fail(f"has a window of {list(kernel)} for {list(shape[1:])} places; export it again")
     share = 1 / math.prod(kernel) if node.type == "AvgPool2d" else 1.0
-    weight = np.full((shape[0], 1, *kernel), share)  # zeros of the padding count
+    # Zeros of the padding count. One number, spread: how large a window is, the file says, and `convolution` limits.
+    weight = np.broadcast_to(share, (shape[0], 1, *kernel))
     with named(node):
         matrix, out = convolution(
             shape, weight, stride=stride, padding=padding, dilation=(1, 1), groups=shape[0]

@@ -75,6 +75,8 @@ def export(network: IntegerNetwork, dt: float, *, training: str | None = None) -
         for number, (pre, weight) in enumerate(sorted(sources.items())):
             source = "input" if pre == INPUT else names[pre]
             synapses = f"{source}_to_{name}"
+            while synapses in names or synapses in nodes:
+                synapses += "_"
             nodes[synapses] = {"type": "Linear", "weight": _dense(population, weight)}
             if not number and (population.decay_u == FORGETS or added.any()):
                 nodes[synapses] |= {"type": "Affine", "bias": added.astype(np.float32)}

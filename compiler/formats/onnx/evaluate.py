@@ -200,7 +200,7 @@ def _gemm_matrix(node: Node, table: Table, operands: Sequence[Any], which: int) 
 
 
 def _einsum_matrix(node: Node, table: Table, operands: Sequence[Any], which: int) -> Sparse:
-    spelled = str(node.attributes["equation"]).replace(" ", "").lower()
+    spelled = str(node.attributes["equation"]).replace(" ", "")
     if "->" not in spelled or "." in spelled or spelled.count(",") > 1:
         raise ValueError("an equation that is not known")
     inputs, out = spelled.split("->")
@@ -215,7 +215,7 @@ def _reduce_axes(node: Node, operands: Sequence[Any]) -> tuple[int, ...]:
         axes = operands[1].ravel().tolist()
     every = range(operands[0].ndim)
     if axes is None or not axes:
-        return () if axes is not None and node.attributes.get("noop_with_empty_axes", 0) else tuple(every)
+        return () if node.attributes.get("noop_with_empty_axes", 0) else tuple(every)
     return tuple(every[axis] for axis in axes)
 
 

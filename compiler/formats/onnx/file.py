@@ -111,6 +111,8 @@ def read_graph(path: Path) -> Graph:
     graph = proto.graph
     if len(graph.node) > NODE_LIMIT:
         raise ModelError(f"has more than {NODE_LIMIT} nodes; export one step of the network instead of all")
+    if graph.sparse_initializer:
+        raise ModelError("keeps constants as sparse tensors, which are not read; export it with dense ones")
     digest = hashlib.sha256(content)
     _bring_data(graph, path.absolute().parent, digest)
     _check(proto)

@@ -115,7 +115,8 @@ def _carried(
         raise ModelError(f"mixes or weighs the neurons of {table.atoms[previous]} differently; {RESET}")
     if abs(beta + removed) > EQUAL * max(abs(beta), abs(removed)):
         raise ModelError(f"keeps {beta:g} of a membrane and {beta + removed:g} of it after a spike; {RESET}")
-    if table.atoms[gate].kind == SPIKE:
+    # Steps of one file are compared with each other when they are grouped.
+    if table.atoms[gate].kind == SPIKE and table.atoms[previous].kind == INPUT_ATOM:
         old = table.atoms[gate]
         new = table.atoms[spike]
         if not np.array_equal(old.theta, new.theta):
@@ -375,14 +376,25 @@ def readout(table: Table, found: Unrolled, outputs: Mapping[str, Affine]) -> tup
     """
     received = {source for sources in found.sources for source in sources}
     ends = [index for index in range(len(found.layers)) if index not in received]
+    states = {found.data} | {atom for layer in found.layers for n in layer for atom in (n.previous, n.gate)}
     votes: list[tuple[int, IntArray, str]] = []
     for index in ends:
         spikes = [n.spike for n in found.layers[index]]
         for name, value in outputs.items():
             others = [atom for atom in value.terms if atom not in spikes]
-            # A running count goes in and out as a state.
-            counter = all(table.atoms[atom].kind == INPUT_ATOM for atom in others) and len(others) <= 1
-            if not counter or any(spike not in value.terms for spike in spikes) or np.ptp(value.bias) > 0:
+            # A running count goes in and out as a state, whole.
+            counters = [
+                table.atoms[atom].kind == INPUT_ATOM
+                and atom not in states
+                and diagonal(value.terms[atom]) == 1
+                for atom in others
+            ]
+            if (
+                not all(counters[:1])
+                or counters[1:]
+                or any(spike not in value.terms for spike in spikes)
+                or np.ptp(value.bias) > 0
+            ):
                 continue
             first = value.terms[spikes[0]]
             label = class_of_each(first)

@@ -139,8 +139,8 @@ def apply(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]
         if not numbers:
             raise ModelError("holds no number")
         return [np.asarray(numbers[0])]
-    if op == "Dropout" and operands[0] is not None:  # passes on what it gets, outside training
-        return [operands[0]]
+    if op == "Dropout" and operands[0] is not None and not any(map(np.any, operands[2:3])):  # type: ignore[arg-type]
+        return [operands[0]]  # passes on what it gets, outside training
     if op in ("Shape", "Size"):
         shape = np.array(atoms.as_affine(operands[0]).shape, np.int64)
         cut = shape[node.attributes.get("start", 0) : node.attributes.get("end", len(shape))]
@@ -237,6 +237,8 @@ def _moved(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None
         or node.attributes.get("reduction", "none") != "none"
     ):
         raise ValueError("only constant padding, and scattering that replaces or adds, are known")
+    if node.op == "Pad" and table.opset < 11:
+        raise ModelError("is the Pad of operators before version 11; export it with opset_version=20")
     positions: list[atoms.Value | None] = list(operands)
     parts: list[Affine] = []
     start = 1

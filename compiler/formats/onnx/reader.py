@@ -46,7 +46,7 @@ def read_onnx(
 def _network(file: Graph, polarities: int | None, polarities_first: bool | None) -> ReadNetwork[Network]:
     table = Table(opset=file.opset)
     facts: list[str] = []
-    graph = _undecided(file, facts)
+    graph, decided = _undecided(file, facts)
     shapes: dict[int, tuple[int, ...]] = {}
     given = {}
     for declared in graph.inputs:
@@ -55,9 +55,21 @@ def _network(file: Graph, polarities: int | None, polarities_first: bool | None)
             INPUT_ATOM, declared.name, math.prod(table.room(shape)), binary=declared.kind == BOOL
         )
         shapes[atom], given[declared.name] = shape, table.value(atom, shape)
+    batches = {shape[0] if len(shape) > 1 else 1 for shape in shapes.values()}
+    if len(shapes) > 1 and len(batches) == 1 and max(batches) > 1:
+        raise ModelError(f"all inputs hold {max(batches)} recordings; export it with a batch of 1")
     results = zip(graph.outputs, run(graph, given, table), strict=True)
     outputs = {name: as_affine(value) for name, value in results}
     for name, value in outputs.items():
+        if (
+            name in decided
+            and value.shape
+            and value.shape[decided[name] % len(value.shape)] != len(value.bias)
+        ):
+            raise ModelError(
+                f"{printable(name)}: ArgMax along axis {decided[name]} of {list(value.shape)} is no decision; "
+                "take it along the classes"
+            )
         require_finite(value, f"output {printable(name)}: ")
     groups = group(table, neurons_of(table, outputs), shapes)
     voters, label, counted = readout(table, groups, outputs)
@@ -99,8 +111,12 @@ def _fixed(declared: Declared, facts: list[str]) -> tuple[int, ...]:
     return tuple(size if isinstance(size, int) else 1 for size in declared.shape)
 
 
-def _undecided(graph: Graph, facts: list[str]) -> Graph:
-    """The graph with what a decision is taken from in place of the decision: of most spikes, the lowest on a tie."""
+def _undecided(graph: Graph, facts: list[str]) -> tuple[Graph, dict[str, int]]:
+    """The graph with what a decision is taken from in place of the decision: of most spikes, the lowest on a tie.
+
+    Beside it the axis of each decision, by what it is taken from.
+    """
+    decided = {}
     makers = {name: node for node in graph.nodes for name in node.outputs}
     outputs = []
     for output in graph.outputs:
@@ -116,8 +132,9 @@ def _undecided(graph: Graph, facts: list[str]) -> Graph:
                 f"output {printable(name)}: the class of the largest of {printable(node.inputs[0])}"
             )
             name = node.inputs[0]
+            decided[name] = int(node.attributes.get("axis", 0))
         outputs += [] if name in outputs else [name]
-    return replace(graph, outputs=tuple(outputs))
+    return replace(graph, outputs=tuple(outputs)), decided
 
 
 def _threshold(neurons: Neurons, *, double: bool) -> float:
