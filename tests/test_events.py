@@ -482,7 +482,7 @@ def test_a_table_above_the_splits(write):
             "own: labels.csv: row 3: label '-1'; give numbers from 0, or names, in all rows",
         ),
         ("a.csv,1\na.csv,2\n", "own: labels.csv: row 3: a.csv stands there twice; keep one of the rows"),
-        ("a.csv\n", "own: labels.csv: row 2: ['a.csv']; give a file, and a value in each column"),
+        ("a.csv\n", "own: labels.csv: row 2: ['a.csv']; give a file, and one value in each column"),
     ],
 )
 def test_a_table_that_cannot_be(listed, rows, line):

@@ -1,4 +1,5 @@
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -179,6 +180,21 @@ def test_what_a_convolution_repeats_is_stored_once_for_every_257_compartments():
     assert (words, words_of_axons(netlist, nets.LOIHI).sum()) == ([7], 602)
     assert len(partition(network, nets.small_target(core_synapse_words=7))) == 1
     assert len(partition(network, nets.small_target(core_synapse_words=6))) == 2
+
+
+def test_a_list_declared_dense_takes_memory_from_its_first_place_to_its_last():
+    """A file may leave places out, and their order open."""
+    network = nets.integer_chain(np.array([[2, 0], [0, 4], [0, 0], [6, 0], [8, 10]]))
+    sparse = nets.seated(network, partition(network, nets.LOIHI), nets.LOIHI)
+    turned = sparse.synapse_target.copy()
+    turned[:2] = turned[1::-1]
+    netlist = replace(
+        sparse, format_index_bits=np.zeros_like(sparse.format_index_bits), synapse_target=turned
+    )
+    used = {use.name: use.used for use in measure(netlist, nets.LOIHI)}
+    words = list_words(np.array([5, 4]), netlist.format_weight_bits[0], 0, nets.LOIHI)
+    assert words_of_axons(netlist, nets.LOIHI).tolist() == words.tolist()
+    assert (used["core.synapse_words"], used["core.dense_base"]) == (words.sum(), 1)
 
 
 def test_the_neuron_that_breaks_a_rule_most_is_named():

@@ -276,7 +276,6 @@ def with_value(name, value, place=0):
         (with_value("threshold", 2**17), "threshold has values outside 0 … 131071"),
         (with_value("bias_mantissa", 4096), "bias_mantissa has values outside -4096 … 4095"),
         (with_value("synapse_target", 5), "synapse_target points beyond its core"),
-        (with_value("synapse_target", 0, 1), "synapse_target leaves a compartment out in a dense list"),
         (with_value("format_exponent", -2), "format_exponent has values outside -1 … 7"),
         (with_value("core_tile", -1), "core_tile has values outside 0 … 65535"),
     ],

@@ -92,25 +92,37 @@ def stored_once(
     return np.array([*seen.values()], np.int64)
 
 
+def _first_and_entries(netlist: Netlist) -> tuple[IntArray, IntArray]:
+    """First place of each list, and its entries in memory: a dense one has all from first to last; (axons,) each."""
+    entries = np.diff(netlist.axon_synapses)
+    some = np.flatnonzero(entries)
+    first = np.zeros_like(entries)
+    if some.size:
+        starts = netlist.axon_synapses[some]
+        first[some], last = (f.reduceat(netlist.synapse_target, starts) for f in (np.minimum, np.maximum))
+        dense = netlist.format_index_bits[netlist.axon_format[some]] == 0
+        entries[some] = np.where(dense, last - first[some] + 1, entries[some])
+    return first, entries
+
+
 def words_of_axons(netlist: Netlist, target: Target) -> IntArray:
     """Words of the list of each axon, (axons,): the memory that a netlist would take if no axons shared any."""
     form = netlist.axon_format
     widths = netlist.format_weight_bits[form], netlist.format_index_bits[form]
-    return list_words(np.diff(netlist.axon_synapses), *widths, target)
+    return list_words(_first_and_entries(netlist)[1], *widths, target)
 
 
-def _stored_words(netlist: Netlist, core: int, target: Target) -> int:
+def _stored_words(netlist: Netlist, core: int, entries: IntArray, target: Target) -> int:
     """Words of the lists that the memory of a core holds, each once."""
     axons = slice(*netlist.core_axons[core : core + 2].tolist())
     ends = netlist.axon_synapses[axons.start : axons.stop + 1]
     place, weight = (
         column[ends[0] : ends[-1]] for column in (netlist.synapse_target, netlist.synapse_weight)
     )
-    lengths = np.diff(ends)
     form = netlist.axon_format[axons]
-    stored = stored_once(form, lengths, place, weight, target)
+    stored = stored_once(form, np.diff(ends), place, weight, target)
     widths = netlist.format_weight_bits[form[stored]], netlist.format_index_bits[form[stored]]
-    return int(list_words(lengths[stored], *widths, target).sum())
+    return int(list_words(entries[axons][stored], *widths, target).sum())
 
 
 def _distinct_per_core(netlist: Netlist, *columns: IntArray) -> IntArray:
@@ -125,17 +137,18 @@ def measure(netlist: Netlist, target: Target) -> tuple[LimitUse, ...]:
     core_of_axon = netlist.core_of_axon()
     from_compartment = netlist.axon_source >= netlist.n_inputs
     source_core = netlist.core_of_compartment()[netlist.axon_source[from_compartment] - netlist.n_inputs]
-    entries = np.diff(netlist.axon_synapses)
-    index_bits = netlist.format_index_bits[netlist.axon_format]
-    dense = (index_bits == 0) & (entries > 0)
+    first, entries = _first_and_entries(netlist)
+    dense = netlist.format_index_bits[netlist.axon_format] == 0
     base = np.zeros(cores, np.int64)
-    np.maximum.at(base, core_of_axon[dense], netlist.synapse_target[netlist.axon_synapses[:-1][dense]])
+    np.maximum.at(base, core_of_axon[dense], first[dense])
     formats = np.unique(np.stack([core_of_axon, netlist.axon_format]), axis=1)
     used = {
         "core.compartments": np.diff(netlist.core_compartments),
         "core.axons_in": np.diff(netlist.core_axons),
         "core.axons_out": np.bincount(source_core, minlength=cores),
-        "core.synapse_words": np.array([_stored_words(netlist, core, target) for core in range(cores)]),
+        "core.synapse_words": np.array(
+            [_stored_words(netlist, core, entries, target) for core in range(cores)]
+        ),
         "core.threshold_slots": _distinct_per_core(netlist, netlist.threshold),
         "core.synapse_formats": np.bincount(formats[0], minlength=cores),
         "core.compartment_configs": _distinct_per_core(netlist, netlist.decay_u, netlist.decay_v),

@@ -274,12 +274,6 @@ def inconsistencies(netlist: Netlist) -> list[str]:
     on_core = np.diff(netlist.core_compartments)[netlist.core_of_axon()[some]]
     if is_outside(netlist.synapse_target, 0, 2**31) or np.any(highest >= on_core):
         found.append("synapse_target points beyond its core")
-    inside = np.repeat(netlist.format_index_bits[netlist.axon_format] == 0, np.diff(netlist.axon_synapses))
-    inside[netlist.axon_synapses[some]] = False
-    if np.any(inside[1:] & (netlist.synapse_target[1:] != netlist.synapse_target[:-1] + 1)):
-        found.append(
-            "synapse_target leaves a compartment out in a dense list, whose format has index_bits 0"
-        )
     if 0 < netlist.blank < netlist.max_depth:
         found.append(f"{netlist.blank} blank steps follow a recording, layers lag up to {netlist.max_depth}")
     for index, layer in enumerate(netlist.layers):
