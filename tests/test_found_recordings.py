@@ -156,15 +156,19 @@ def test_a_silent_recording_of_any_kind(tmp_path):
 def test_two_tables_say_what_one_does_not(write):
     for name in ("test/a.csv", "test/b.csv", "train/b.csv"):
         write(f"own/{name}", f"{HEADER}0,0,1\n0.1,0,1\n")
-    write("own/labels.csv", "file,label\ntest/b.csv,1\nb.csv,3\na.csv,2\n")
+    write("own/labels.csv", "file,label,hand\ntest/b.csv,1,\nb.csv,3,\na.csv,2,left\n")
     folder = write(
         "own/test/recordings.csv", "file,duration_s,hand\na.csv,0.2,left\nb.csv,0.3,right\n"
     ).parents[1]
     found = load_data(folder, split="test")
     assert found.labels.tolist() == [2, 1]  # the row of a path before that of a name
     assert (found.step_counts.tolist(), found.groups) == ([10, 15], {"hand": ("left", "right")})
-    write("own/test/labels.csv", "file,label\na.csv,2\nb.csv,5\n")
-    words = "own: test/labels.csv: test/b.csv: label is '5' here and '1' in another table; keep one of them"
+    write("own/test/labels.csv", "file,label,hand\na.csv,5,\n")
+    found = load_data(folder, split="test")
+    assert found.labels.tolist() == [5, 1]  # the nearer table
+    assert found.groups == {"hand": ("left", "right")}
+    write("own/test/recordings.csv", "file,label\na.csv,4\n")
+    words = "own: test/recordings.csv: test/a.csv: label is '4' here and '5' in the table beside it; keep one of them"
     assert refused(DataError, "", load_data, folder, split="test") == words
 
 

@@ -107,7 +107,7 @@ NODES = [
         "node stage (Strange): is of the domain my.own, allowed are the",
         helper.make_node("Strange", ["current"], ["stage"], domain="my.own"),
     ),
-    (f"node stage (Dropout): {AFFINE}", node("Dropout", "current one yes", "stage")),
+    ("node stage (Dropout): is in training mode; export", node("Dropout", "current one yes", "stage")),
 ]
 KEEPS = "k = Mul(u0, beta); m = Add(k, current)"
 AFTER = f"{KEEPS}; hot = Greater(m, theta); s0_new = Cast(hot)"

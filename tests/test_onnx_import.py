@@ -104,11 +104,18 @@ def test_at_the_threshold_is_the_next_number_below(read):
     [
         (node("Add", "count s0_new", "classes"), [("count", [1, 3])], [0, 1, 2]),  # a running count
         (node("MatMul", "s0_new votes", "classes"), [], [0, 1, 0]),
+        (
+            node("MatMul", "sums votes", "classes"),
+            [("count", [1, 3])],
+            [0, 1, 0],
+        ),  # of a count of each neuron
     ],
 )
 def test_how_spikes_are_counted(read, last, inputs, label):
     votes = {"votes": np.array([[1, 0], [0, 1], [1, 0]], np.float32)}
-    nodes, outputs = [*STAGE, *neuron(0, "current"), last], ["classes", "u0_new", "s0_new"]
+    sums = [node("Add", "count s0_new", "sums")] if "sums" in last.input else []
+    nodes = [*STAGE, *neuron(0, "current"), *sums, last]
+    outputs = ["classes", "u0_new", "s0_new", *(["sums"] if sums else [])]
     network = read(model(nodes, [("x", [1, 4]), *STATE_IN[:2], *inputs], outputs, votes)).network
     assert network.readout.label.tolist() == label
     assert network.classes == max(label) + 1
@@ -193,6 +200,16 @@ def test_open_size_in_front_is_one_recording(read):
     assert_same_network(
         compile_network(module_network(net, example)).integer, compile_network(found.network).integer
     )
+
+
+def test_taxels_in_front_are_no_batch(read):
+    """A network on a graph, without a batch: three taxels in front of all inputs, which its weights mix."""
+    constants = {"graph": np.array([[1, 0.5, 0], [0.5, 1, 0.5], [0, 0.5, 1]], np.float32)}
+    nodes = [node("MatMul", "graph x", "mixed"), node("MatMul", "mixed w", "current"), *neuron(0, "current")]
+    ends = [("x", [3, 2]), ("u0", [3, 4]), ("s0", [3, 4])]
+    constants["w"] = np.array([[0.5, -0.25, 1.0, 0.125], [0.75, 0.5, -0.5, 0.25]], np.float32)
+    network = read(model(nodes, ends, ["s0_new", "u0_new"], constants)).network
+    assert (network.input.taxels, network.input.polarities, network.classes) == (3, 2, 12)
 
 
 def test_the_largest_of_the_votes_is_what_is_counted(read):

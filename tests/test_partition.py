@@ -187,7 +187,7 @@ def test_a_list_declared_dense_takes_memory_from_its_first_place_to_its_last():
     network = nets.integer_chain(np.array([[2, 0], [0, 4], [0, 0], [6, 0], [8, 10]]))
     sparse = nets.seated(network, partition(network, nets.LOIHI), nets.LOIHI)
     turned = sparse.synapse_target.copy()
-    turned[:2] = turned[1::-1]
+    turned[:2] = turned[1::-1]  # out of order
     netlist = replace(
         sparse, format_index_bits=np.zeros_like(sparse.format_index_bits), synapse_target=turned
     )

@@ -261,6 +261,7 @@ def rows_beside(members: Members, files: Sequence[str], source: str) -> Listed:
     parents = {PurePosixPath(file).parent: None for file in files}
     folders = dict.fromkeys([PurePosixPath(), *(folder.parent for folder in parents), *parents])
     for folder in folders:
+        here: dict[str, Row] = {}
         for table in sorted(
             name for name in members if is_table(name) and PurePosixPath(name).parent == folder
         ):
@@ -271,30 +272,34 @@ def rows_beside(members: Members, files: Sequence[str], source: str) -> Listed:
                 continue
             inside = [file for file in files if PurePosixPath(file).is_relative_to(folder)]
             found = {file: row for file in inside for row in _rows_of(rows, PurePosixPath(file), folder)}
-            known |= {
-                file: _merged(known.get(file, NOTHING), row, f"{where}: {file}")
-                for file, row in found.items()
-            }
+            for file, row in found.items():
+                _require_alike(here.get(file, NOTHING), row, f"{where}: {file}")
+                here[file] = _with(here.get(file, NOTHING), row)
             classes |= {row.label for row in rows.values() if row.label is not None}
             if len(found) < len(files):
                 notes.append(f"{where}: describes {len(found)} of {len(files)} recordings")
+        known |= {file: _with(known.get(file, NOTHING), row) for file, row in here.items()}
     return Listed(rows=known, classes=frozenset(classes), notes=notes)
 
 
-def _merged(known: Row, row: Row, where: str) -> Row:
-    """What two tables say of a recording; DataError if they contradict each other."""
+def _with(known: Row, row: Row) -> Row:
+    """What two tables say of a recording: where both do, the second, which is nearer to it."""
+    return Row(
+        label=known.label if row.label is None else row.label,
+        duration_s=known.duration_s if row.duration_s is None else row.duration_s,
+        groups=row.groups | known.groups | {name: value for name, value in row.groups.items() if value},
+    )
+
+
+def _require_alike(known: Row, row: Row, where: str) -> None:
+    """Refuse two tables side by side that contradict each other: DataError."""
     first, second = (
         {"label": each.label, DURATION: each.duration_s, **each.groups} for each in (known, row)
     )
     for name in first.keys() & second.keys():
-        if None not in (first[name], second[name]) and first[name] != second[name]:
-            words = f"{name} is {second[name]!r} here and {first[name]!r} in another table"
+        if first[name] != second[name] and not {None, ""} & {first[name], second[name]}:
+            words = f"{name} is {second[name]!r} here and {first[name]!r} in the table beside it"
             raise DataError(f"{where}: {words}; keep one of them")
-    return Row(
-        label=known.label if row.label is None else row.label,
-        duration_s=known.duration_s if row.duration_s is None else row.duration_s,
-        groups=known.groups | row.groups,
-    )
 
 
 def _rows_of(rows: Mapping[str, Row], file: PurePosixPath, folder: PurePosixPath) -> list[Row]:

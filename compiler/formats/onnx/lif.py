@@ -382,11 +382,15 @@ def readout(table: Table, found: Unrolled, outputs: Mapping[str, Affine]) -> tup
         spikes = [n.spike for n in found.layers[index]]
         for name, value in outputs.items():
             others = [atom for atom in value.terms if atom not in spikes]
-            # A running count goes in and out as a state, whole.
+            # A running count goes in and out as a state: of classes, or of the neurons that they group.
+            like_spikes = [value.terms[spike] for spike in spikes if spike in value.terms]
             counters = [
                 table.atoms[atom].kind == INPUT_ATOM
                 and atom not in states
-                and diagonal(value.terms[atom]) == 1
+                and (
+                    diagonal(value.terms[atom]) == 1
+                    or any(_equal(value.terms[atom], own) for own in like_spikes)
+                )
                 for atom in others
             ]
             if (

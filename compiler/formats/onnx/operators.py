@@ -139,8 +139,8 @@ def apply(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]
         if not numbers:
             raise ModelError("holds no number")
         return [np.asarray(numbers[0])]
-    if op == "Dropout" and operands[0] is not None and not any(map(np.any, operands[2:3])):  # type: ignore[arg-type]
-        return [operands[0]]  # passes on what it gets, outside training
+    if op == "Dropout" and operands[0] is not None:
+        return [_kept(operands[0], operands[2:3])]
     if op in ("Shape", "Size"):
         shape = np.array(atoms.as_affine(operands[0]).shape, np.int64)
         cut = shape[node.attributes.get("start", 0) : node.attributes.get("end", len(shape))]
@@ -162,6 +162,13 @@ def apply(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]
     else:
         result = _elementwise(node, table, operands, varying)
     return [result]
+
+
+def _kept(value: atoms.Value, training: Sequence[atoms.Value | None]) -> atoms.Value:
+    """What Dropout passes on outside training: what it gets."""
+    if any(map(np.any, training)):  # type: ignore[arg-type]
+        raise ModelError("is in training mode; export the module after eval()")
+    return value
 
 
 def _constant(node: Node, table: atoms.Table, operands: Sequence[atoms.Value | None]) -> list[atoms.Value]:

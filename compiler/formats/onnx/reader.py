@@ -23,7 +23,7 @@ from spikeloom.compiler.formats.onnx.file import BOOL, DOUBLE, Declared, Graph, 
 from spikeloom.compiler.formats.onnx.lif import Neurons, Unrolled, group, is_output, neurons_of, readout
 from spikeloom.compiler.formats.onnx.operators import run
 from spikeloom.compiler.formats.sensor_layout import order_of, sensor_layout
-from spikeloom.compiler.ir import INPUT, Network
+from spikeloom.compiler.ir import INPUT, Network, Sparse
 
 
 def read_onnx(
@@ -55,9 +55,6 @@ def _network(file: Graph, polarities: int | None, polarities_first: bool | None)
             INPUT_ATOM, declared.name, math.prod(table.room(shape)), binary=declared.kind == BOOL
         )
         shapes[atom], given[declared.name] = shape, table.value(atom, shape)
-    batches = {shape[0] if len(shape) > 1 else 1 for shape in shapes.values()}
-    if len(shapes) > 1 and len(batches) == 1 and max(batches) > 1:
-        raise ModelError(f"all inputs hold {max(batches)} recordings; export it with a batch of 1")
     results = zip(graph.outputs, run(graph, given, table), strict=True)
     outputs = {name: as_affine(value) for name, value in results}
     for name, value in outputs.items():
@@ -72,6 +69,7 @@ def _network(file: Graph, polarities: int | None, polarities_first: bool | None)
             )
         require_finite(value, f"output {printable(name)}: ")
     groups = group(table, neurons_of(table, outputs), shapes)
+    _require_one_recording(groups, shapes)
     voters, label, counted = readout(table, groups, outputs)
     sensor, positions, words = sensor_layout(
         groups.shape, polarities=polarities, polarities_first=polarities_first
@@ -109,6 +107,25 @@ def _fixed(declared: Declared, facts: list[str]) -> tuple[int, ...]:
         fact = f"the open size {size or '?'!r} is the batch's, read as 1"
         facts += [] if isinstance(size, int) or fact in facts else [fact]
     return tuple(size if isinstance(size, int) else 1 for size in declared.shape)
+
+
+def _require_one_recording(found: Unrolled, shapes: Mapping[int, tuple[int, ...]]) -> None:
+    """Refuse a batch: inputs of one size in front, and weights that mix none of its parts."""
+    batches = {shape[0] if len(shape) > 1 else 1 for shape in shapes.values()}
+    batch = max(batches)
+    if len(shapes) == 1 or len(batches) > 1 or batch == 1:
+        return
+    weights = [weight for sources in found.sources for weight in sources.values()]
+    if all(_is_apart(weight, batch) for weight in weights):
+        raise ModelError(f"all inputs hold {batch} recordings; export it with a batch of 1")
+
+
+def _is_apart(weight: Sparse, parts: int) -> bool:
+    """Whether a matrix is block-diagonal, of so many blocks of one size."""
+    if any(size % parts for size in weight.shape):
+        return False
+    rows, columns = weight.nonzero()
+    return np.array_equal(rows * parts // weight.shape[0], columns * parts // weight.shape[1])
 
 
 def _undecided(graph: Graph, facts: list[str]) -> tuple[Graph, dict[str, int]]:

@@ -101,7 +101,8 @@ def _first_and_entries(netlist: Netlist) -> tuple[IntArray, IntArray]:
         starts = netlist.axon_synapses[some]
         first[some], last = (f.reduceat(netlist.synapse_target, starts) for f in (np.minimum, np.maximum))
         dense = netlist.format_index_bits[netlist.axon_format[some]] == 0
-        entries[some] = np.where(dense, last - first[some] + 1, entries[some])
+        span = np.where(dense, last - first[some] + 1, 0)
+        entries[some] = np.maximum(span, entries[some])
     return first, entries
 
 
