@@ -1,6 +1,7 @@
 """Every spike of other simulators of Loihi beside ours, on all test recordings, once; SANA-FE's energy and time too.
 
-``python benchmarks/agreement.py DATA OUT.json NET.loom … --python brian2=PATH …`` goes on where OUT.json ends.
+``python benchmarks/agreement.py DATA OUT.json NET.loom … --python lava=PATH --limit lava=4 …`` goes on where OUT.json
+ends.
 
 No simulator knows windows, so all layers of ours are open throughout, and biases act from the first step. SANA-FE loads
 what ``export --to sanafe`` writes; its energy and simple time are compared under its conventions, and with what
@@ -196,7 +197,9 @@ def options() -> argparse.Namespace:
     parser.add_argument(
         "--python", action="append", required=True, metavar="NAME=PATH", help="interpreter of a rival"
     )
-    parser.add_argument("--limit", type=int, help="of the recordings")
+    parser.add_argument(
+        "--limit", action="append", default=[], metavar="NAME=N", help="recordings of a slow rival"
+    )
     return parser.parse_args()
 
 
@@ -209,7 +212,7 @@ def write(path: Path, result: dict[str, Any]) -> None:
 def main() -> None:
     """Compare, write after each simulator."""
     asked = options()
-    pythons = dict(pair.split("=", 1) for pair in asked.python)
+    pythons, limits = (dict(pair.split("=", 1) for pair in given) for given in (asked.python, asked.limit))
     train, data = (load_data(asked.data, split, taxels=39) for split in ("train", "test"))
     output = Path(asked.output)
     networks = json.loads(output.read_text("utf-8"))["networks"] if output.exists() else {}
@@ -229,7 +232,7 @@ def main() -> None:
         }
         for name, python in pythons.items():
             run: Callable[..., dict[str, Any]] = compare if name in RIVALS else compare_sanafe
-            wanted = min(asked.limit or len(events), len(events))
+            wanted = min(int(limits.get(name, len(events))), len(events))
             while (first := facts.get(name, {}).get("recordings", 0)) < wanted:
                 last, begun = min(wanted, first + (TOGETHER if first else FIRST)), time.monotonic()
                 part = events[first:last]
