@@ -131,7 +131,10 @@ def run(name: str, place: Path, sources: list[Path]) -> dict[str, Any]:
     seconds = (time.time_ns() - began) / 1e9
     if program == "spikeloom":
         (results / name).write_text(done.stdout, "utf-8")
-    if done.returncode not in (0, 1) or not (results / name).exists():
+    fine = (
+        (0, 1) if program == "spikeloom" else (0,)
+    )  # 1 is a failed check of a command, of a script its end
+    if done.returncode not in fine or not (results / name).exists():
         raise RuntimeError(f"exit code {done.returncode}\n{done.stderr[-2000:]}")
     return {"seconds": round(seconds, 1), "files": depends(place / "log", place, began)}
 

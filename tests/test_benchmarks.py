@@ -206,6 +206,23 @@ def test_a_run_again_finds_nothing_that_was_finished_before(stored, tmp_path, mo
     assert seen.isdisjoint({"work", "1.json", "x.parts.json"})
 
 
+def test_part_of_a_result_is_none(stored, tmp_path, monkeypatch):
+    """A script that ends with an error may have written some of it."""
+    here, place = tmp_path / "here", tmp_path / "place"
+    here.mkdir()
+    (here / "half.py").write_text(
+        "import pathlib, sys\npathlib.Path(sys.argv[1]).write_text('{}')\nsys.exit('no more')\n"
+    )
+    (here / "results").mkdir()
+    (here / "results" / "half.json").write_text("{}")
+    (stored.RESULTS / "half.json").write_text('{"command": "python benchmarks/half.py half.json"}')
+    monkeypatch.setattr(stored, "HERE", here)
+    place.mkdir()
+    with pytest.raises(RuntimeError, match="exit code 1\nno more"):
+        stored.run("half.json", place, [])
+    assert (place / "benchmarks" / "results" / "half.json").exists()
+
+
 def test_what_a_run_wrote_is_none_of_its_sources(stored, tmp_path):
     (tmp_path / "benchmarks").mkdir()
     file = tmp_path / "benchmarks" / "made.py"
