@@ -6,9 +6,9 @@
 
 A result depends on the files of this repository that the processes of its command opened to read, pages left out;
 ``traced/sitecustomize.py`` notes them. ``--write`` stores the new result with its pictures, and in ``results/runs`` the
-seconds that it took and a digest of each of these files: of Python its statements without comments, docstrings and the
-words of ``--help``, of others the bytes. A result without such a record is ``not known`` to be up to date; ``finished``
-is one whose script is only in the history. Commands run in a copy of this folder, beside links to
+seconds that it took, the processor, and a digest of each of these files: of Python its statements without comments,
+docstrings and the words of ``--help``, of others the bytes. A result without such a record is ``not known`` to be up to
+date; ``finished`` is one whose script is only in the history. Commands run in a copy of this folder, beside links to
 ``$SPIKELOOM_SHARED/data``, ``checkpoints``, and what else they read, in FOLDER.
 """
 
@@ -19,6 +19,7 @@ import itertools
 import json
 import math
 import os
+import platform
 import re
 import shlex
 import shutil
@@ -136,7 +137,22 @@ def run(name: str, place: Path, sources: list[Path]) -> dict[str, Any]:
     )  # 1 is a failed check of a command, of a script its end
     if done.returncode not in fine or not (results / name).exists():
         raise RuntimeError(f"exit code {done.returncode}\n{done.stderr[-2000:]}")
-    return {"seconds": round(seconds, 1), "files": depends(place / "log", place, began)}
+    return {
+        "seconds": round(seconds, 1),
+        "processor": processor(),
+        "files": depends(place / "log", place, began),
+    }
+
+
+def processor() -> str:
+    """Name, family and model, as Linux tells them: hosts give processors of several generations one name."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text("ascii", "replace").split("\n\n")[0].splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    found = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    known = [f"{key} {found[key]}" for key in ("cpu family", "model") if key in found]
+    return ", ".join([found.get("model name", platform.machine()), *known])
 
 
 def differences(old: Any, new: Any, path: str = "") -> Iterator[str]:

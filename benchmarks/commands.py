@@ -29,9 +29,13 @@ from typing import Any
 
 from made import made
 
+import spikeloom.compiler
 from spikeloom.models.recordings.events import load_data
 
 DEFAULT = Path(__file__).parent / "results" / "commands.json"
+THIS = Path(spikeloom.compiler.__file__).resolve().parents[1]
+TRACED = [str(Path(__file__).parent / "traced")] if "SPIKELOOM_TRACE" in os.environ else []
+"""Notes, where a record is to be made, what the commands open."""
 
 MAKE = {
     "objects.loom": "compile {checkpoint} --graph manual --calibrate {recordings} -o {file}",
@@ -88,7 +92,11 @@ class Tree:
         start, path = self.command()
         given = [word.format(folder=self.folder, **values) for word in words.split()]
         line = ["taskset", "-c", str(core), "timeout", str(limit), *start, *given]
-        more = {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "NUMBA_CACHE_DIR": str(cache)}
+        more = {
+            "PYTHONPATH": os.pathsep.join([*TRACED, path]),
+            "OMP_NUM_THREADS": "1",
+            "NUMBA_CACHE_DIR": str(cache),
+        }
         more["PYTHONDONTWRITEBYTECODE"] = ""  # modules are read as after a first start
         begun = time.perf_counter()
         with (self.folder / "log").open("wb") as log:
@@ -167,7 +175,7 @@ def main() -> None:
     parser.add_argument("checkpoint")
     parser.add_argument("recordings")
     parser.add_argument("--old", type=Path, required=True)
-    parser.add_argument("--new", type=Path, default=Path(__file__).parents[1])
+    parser.add_argument("--new", type=Path, default=THIS)
     parser.add_argument(
         "--only", nargs="+", choices=JOBS, default=list(JOBS), metavar="NAME", help=", ".join(JOBS)
     )
@@ -190,8 +198,10 @@ def main() -> None:
     values["wide"] = (
         old.make("wide.pt", folder, values, arguments.core) if "wide" in " ".join(arguments.only) else ""
     )
+    commit = ["git", "-C", str(old.path), "rev-parse", "--short=8", "HEAD"]
     results = made(*(load_data(values["recordings"], each) for each in ("train", "test"))) | {
-        "jobs": json.loads(output.read_text())["jobs"] if output.exists() else {}
+        "old": subprocess.run(commit, capture_output=True, text=True, check=True).stdout.strip(),
+        "jobs": json.loads(output.read_text())["jobs"] if output.exists() else {},
     }
     for job in arguments.only:
         found = results["jobs"][job] = measure(job, (old, new), values, arguments)
