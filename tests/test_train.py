@@ -1,6 +1,10 @@
 """The training loop: the released protocol, repeatable to the byte; fine-tuning on the integers of the chip."""
 
 import json
+import os
+import platform
+import subprocess
+import sys
 from dataclasses import replace
 
 import made_files
@@ -198,6 +202,29 @@ def killed(done: Epoch) -> None:
 
 def same(a: object, b: object) -> bool:
     return all(np.array_equal(a[name], b[name]) for name in a) and set(a) == set(b)
+
+
+LOSS = """
+import numpy as np
+from spikeloom.models.training.evaluate import loss_of
+from spikeloom.models.training.recipes import RECIPES
+import torch
+rates = torch.rand(256, 36, generator=torch.Generator().manual_seed(0), requires_grad=True)
+loss_of(RECIPES["rates"], rates, np.arange(256) % 36).backward()
+print(rates.grad.numpy().tobytes().hex())
+"""
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="has no AVX2")
+def test_gradients_are_the_same_on_processors_of_two_widths():
+    known = {name: value for name, value in os.environ.items() if name != "ATEN_CPU_CAPABILITY"}
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", LOSS], env=known | wide, capture_output=True, check=True
+        ).stdout
+        for wide in ({}, {"ATEN_CPU_CAPABILITY": "avx2"})
+    }
+    assert len(found) == 1
 
 
 @pytest.mark.parametrize("robust", [0.0, 0.2])

@@ -1,11 +1,13 @@
 """Loss and accuracy of a network, in small batches."""
 
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
 import torch
+from llvmlite.binding import get_host_cpu_features
 from torch import Tensor
 
 from spikeloom.compiler.errors import DataError
@@ -15,6 +17,11 @@ from spikeloom.models.recordings.evtouch import Recordings
 from spikeloom.models.training.recipes import CROSS_ENTROPY, RELEASED, Recipe
 
 TEST_BATCH = 2  # larger batches outgrow the cache
+
+if get_host_cpu_features().get("avx512f"):
+    # Else log_softmax adds up in another order than with AVX2, and a seed gives other weights. torch reads this at
+    # its first computation.
+    os.environ.setdefault("ATEN_CPU_CAPABILITY", "avx2")
 
 
 def evaluate(

@@ -6,7 +6,8 @@ The released script reads recordings in the order that the folder lists them, un
 machine to machine. Here each epoch shuffles them anew, from the seed.
 
 Everything runs on one thread: at one recording per step a second thread gains little, and so a seed gives
-the same weights whatever the number of cores.
+the same weights whatever the number of cores. Sums are in the order of AVX2, so that processors with AVX-512
+give them, too.
 
 A training is reported at three epochs, side by side. *Last*: nothing is chosen. *Best epoch on test*: the
 maximum over epochs, chosen on the test split. *Clean*: a first training leaves a fifth of the training split
