@@ -49,6 +49,7 @@ def main() -> None:
     """Fine-tune every network for every storage and store what was found."""
     source, folder, output, *networks = sys.argv[1:]
     data = spikeloom.recordings(source)
+    Path(folder).mkdir(exist_ok=True)
     found: list[dict[str, Any]] = []
     for place, path in enumerate(networks, 1):
         step: dict[str, Any] = {"dt": 1e-4} if path.endswith(".nir") else {}
