@@ -52,7 +52,9 @@ for line in sys.stdin:
 """
 
 
-def written(folder: Path, environment: dict[str, str]) -> dict[str, bytes]:
+def written(
+    folder: Path, environment: dict[str, str], commands: tuple[str, ...] = COMMANDS
+) -> dict[str, bytes]:
     """Files that all commands write in a process of this environment."""
     folder.mkdir()
     recordings_folder(folder / "data", train=events(1, samples=12), test=events(2, samples=6))
@@ -62,7 +64,7 @@ def written(folder: Path, environment: dict[str, str]) -> dict[str, bytes]:
         env={name: value for name, value in os.environ.items() if not name.startswith(("LC_", "LANG"))}
         | {"PYTHONPATH": os.pathsep.join(sys.path)}
         | environment,
-        input="\n".join(COMMANDS),
+        input="\n".join(commands),
         text=True,
         capture_output=True,
         check=False,
@@ -83,3 +85,11 @@ def test_files_are_the_same_in_every_process(process, expected, tmp_path):
         found
     )
     assert [name for name in expected if found.get(name) != expected[name]] == []
+
+
+def test_large_products_are_the_same_on_one_thread_and_on_two(tmp_path):
+    command = "finetune pretrained:objects --weight-bits 4 --epochs 1 --data synthetic -o net.pt"
+    one, two = (
+        written(tmp_path / name, PROCESSES[name], (command,)) for name in ("one thread", "two threads")
+    )
+    assert one["net.pt"] == two["net.pt"]

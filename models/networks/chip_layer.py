@@ -73,12 +73,19 @@ class ChipLayer(torch.autograd.Function):
         weight = np.zeros_like(integers.units)
         scatter(source, bounds, rows, weight[:inputs])
         if stage.inputs < len(weight):
-            weight[inputs:] = fired[:-1].reshape(-1, neurons).T @ rows[samples:]
+            weight[inputs:] = _product(fired[:-1].reshape(-1, neurons).T, rows[samples:])
         below = None
         if ctx.needs_input_grad[0]:
-            below = torch.from_numpy(rows @ integers.real[:, :inputs]).view(len(membrane), samples, -1)
+            below = torch.from_numpy(_product(rows, integers.real[:, :inputs]))
+            below = below.view(len(membrane), samples, -1)
         bias = through_bias.reshape(-1, neurons).sum(0)
         return below, torch.from_numpy(weight[stage.column, stage.row]), torch.from_numpy(bias), None, None
+
+
+def _product(left: Array, right: Array) -> Array:
+    """``left @ right`` by torch; numpy adds up in another order by threads and processor, which a seed would show."""
+    product: Array = torch.mm(torch.from_numpy(left), torch.from_numpy(right)).numpy()
+    return product
 
 
 def _backwards(
@@ -95,7 +102,9 @@ def _backwards(
     direct = np.empty_like(membrane)
     later, drained = np.zeros((2, membrane.shape[1]), np.float32)
     for t in range(len(membrane) - 1, -1, -1):
-        given = above[t] + (drained.reshape(samples, -1) @ recurrent).ravel() if recurrent.size else above[t]
+        given = above[t]
+        if recurrent.size:
+            given = given + _product(drained.reshape(samples, -1), recurrent).ravel()
         differentiate_step(given, membrane[t], later, beta, theta, width, reset, smooth, direct[t])
         later = direct[t]
         np.add(later, alpha * drained, out=current[t])
